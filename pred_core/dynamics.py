@@ -1,0 +1,44 @@
+"""The one protocol every predictor obeys: spring-mass, PReD, every baseline."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from pred_core.types import Grip, State
+
+
+@runtime_checkable
+class Dynamics(Protocol):
+    """Predicts one period at a time; batched over leading axes; `step` returns a new State."""
+
+    @property
+    def period(self) -> float:
+        """[s] the time one step covers."""
+
+    def start(self, state: State, grip: Grip | None = None) -> State:
+        """The state with this Dynamics' memory filled in.
+
+        `grip` is the gripper pose at the state's own time; it fixes where in the gripper the held
+        particles sit. Raises: InputError if particles are held and no grip is given.
+        """
+
+    def step(self, state: State, grip: Grip) -> State:
+        """The state one period later; `grip` is the gripper pose at the end of the period."""
+
+    def rollout(self, state: State, grips: Grip) -> Tensor:
+        """Positions (T, ..., N, 3) after each of T periods; equals T calls of `step`.
+
+        `grips` has a leading axis T. Raises: DivergenceError if a position leaves the finite numbers.
+        """
+
+
+def rollout_by_steps(dynamics: Dynamics, state: State, grips: Grip) -> Tensor:
+    """The plain `rollout`: one `step` a period. Used by Dynamics that have nothing faster."""
+    positions = []
+    for t in range(grips.position.shape[0]):
+        state = dynamics.step(state, grips.at(t))
+        positions.append(state.position)
+    return torch.stack(positions)
