@@ -1,0 +1,51 @@
+"""`pred COMMAND ...`: one module a command, imported only when it is asked for."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+
+from pred_core.errors import PredError, nearest
+
+COMMANDS: tuple[str, ...] = ("info", "convert", "identify", "train", "evaluate")
+INTERRUPTED = 130  # the shell's code for SIGINT
+BAD_INPUT = 2
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command. Returns the exit code: 0 done, 2 bad input (one line on stderr), 130 interrupted."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    name = next((a for a in arguments if not a.startswith("-")), None)
+    try:
+        if name is not None and name not in COMMANDS:
+            raise PredError(f"unknown command '{name}'", next_step=nearest(name, COMMANDS))
+        chosen = COMMANDS if name is None else (name,)
+        args = _parser({c: _module(c) for c in chosen}).parse_args(arguments)
+        return int(args.run(args))
+    except PredError as error:
+        print(f"pred: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("pred: interrupted; run the same command again to go on where it stopped", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _module(name: str) -> ModuleType:
+    return importlib.import_module(f"pred_core.cli.{name}_command")
+
+
+def _parser(modules: dict[str, ModuleType]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="pred", description="Track, predict, diagnose and drive soft objects.")
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, module in modules.items():
+        sub = subparsers.add_parser(name, help=module.HELP, description=module.HELP)
+        module.configure(sub)
+        sub.set_defaults(run=module.run)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
