@@ -1,0 +1,128 @@
+"""PReD as a Dynamics: the paper's update, held particles, memory that forks."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from residual_case import PERIOD, Falling, line_body, random_state, still_grip
+
+from pred_core.dynamics import Dynamics
+from pred_core.errors import DivergenceError, InputError
+from pred_core.pred import FRAME, PReD, with_residual
+from pred_core.residual import ResidualConfig, build_network
+from pred_core.types import State, stack_states
+
+SMALL = ResidualConfig(feature=16, hidden=16, embedding=16, feedforward=32, encoder_feedforward=32, encoder_layers=2)
+
+
+def model(seed: int = 0, untrained: bool = False) -> PReD:
+    network = build_network(SMALL, seed)
+    generator = torch.Generator().manual_seed(seed)
+    if not untrained:
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter += 0.2 * torch.randn(parameter.shape, generator=generator)
+    return PReD(Falling(), network, line_body())
+
+
+def test_is_a_dynamics() -> None:
+    assert isinstance(model(), Dynamics)
+
+
+def test_untrained_pred_is_its_base_bit_for_bit() -> None:
+    start = random_state(torch.Generator().manual_seed(0), 2)
+    grips = still_grip(5, 2)
+    base = Falling()
+    pred = model(untrained=True)
+    expected = base.rollout(base.start(start, grips.at(0)), grips)
+    assert pred.rollout(pred.start(start, grips.at(0)), grips).equal(expected)
+
+
+def test_update_is_the_papers_and_held_particles_get_nothing() -> None:
+    pred = model()
+    state = pred.start(random_state(torch.Generator().manual_seed(0), 4), still_grip(4))
+    for _ in range(3):
+        with torch.no_grad():
+            step = pred.advance(state, still_grip(4))
+        assert step.residual[:, 0].eq(0).all() and step.residual[:, 1:].abs().min() > 0
+        assert torch.allclose(step.state.velocity, step.predicted.velocity + step.residual)
+        assert torch.allclose(step.state.position, step.predicted.position + step.residual * PERIOD)
+        state = step.state
+
+
+def test_batch_equals_loop_and_rollout_equals_steps() -> None:
+    pred = model()
+    generator = torch.Generator().manual_seed(1)
+    singles = [random_state(generator) for _ in range(3)]
+    grips = still_grip(8, 3)
+    whole = pred.rollout(pred.start(stack_states(singles), grips.at(0)), grips)
+    for b, single in enumerate(singles):
+        state = pred.start(single, still_grip())
+        for t in range(8):
+            state = pred.step(state, still_grip())
+            assert torch.allclose(state.position, whole[t, b], atol=1e-5)
+
+
+def test_memory_forks_with_the_state() -> None:
+    pred = model()
+    trunk = pred.start(random_state(torch.Generator().manual_seed(2)), still_grip())
+    for _ in range(3):
+        trunk = pred.step(trunk, still_grip())
+    before = {k: v.clone() for k, v in trunk.memory.items()}
+    first = pred.step(trunk, still_grip())
+    pred.step(pred.step(first, still_grip()), still_grip())  # another branch must leave no trace
+    again = pred.step(trunk, still_grip())
+    assert first.position.equal(again.position)
+    assert all(trunk.memory[k].equal(v) for k, v in before.items())
+    fresh = pred.start(State(trunk.position, trunk.velocity, trunk.held), still_grip())
+    assert not pred.step(fresh, still_grip()).position.equal(first.position)  # the memory matters
+    forks = pred.step(stack_states([trunk, trunk]), still_grip(2))
+    assert torch.allclose(forks.position[1], first.position, atol=1e-5)
+
+
+def test_network_frame_turns_inputs_and_outputs() -> None:
+    # Seen at azimuth 180 degrees about z, (x, y, z) is (-x, -y, z): turning the world instead gives the same.
+    pred = model()
+    state = random_state(torch.Generator().manual_seed(3))
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    turned = dataclasses.replace(state, position=state.position @ half_turn, velocity=state.velocity @ half_turn)
+    plain = pred.start(state, still_grip())
+    seen = plain.replace(memory={**plain.memory, FRAME: half_turn})
+    other = pred.start(turned, still_grip())
+    for _ in range(3):
+        seen, other = pred.step(seen, still_grip()), pred.step(other, still_grip())
+    assert torch.allclose(seen.position, other.position @ half_turn, atol=1e-5)
+    assert not torch.allclose(seen.position, pred.rollout(plain, still_grip(3))[-1], atol=1e-5)
+
+
+def test_bad_states_are_refused() -> None:
+    pred = model()
+    with pytest.raises(InputError, match="7 particles"):
+        pred.start(random_state(torch.Generator(), count=7), still_grip())
+    with pytest.raises(InputError, match="start"):
+        pred.step(random_state(torch.Generator()), still_grip())
+
+
+def test_divergence_names_the_step() -> None:
+    pred = model()
+    state = pred.start(random_state(torch.Generator().manual_seed(0)), still_grip())
+    grips = still_grip(4)
+    grips.position[2] = float("nan")
+    with pytest.raises(DivergenceError, match="step 3"):
+        pred.rollout(state, grips)
+
+
+def test_twin_without_residual_stays_the_base() -> None:
+    from pred_core.twin import Twin, TwinMeta
+    from pred_core.types import Physics
+
+    base = Falling()
+    twin = Twin(TwinMeta(), line_body(), Physics())
+    assert with_residual(base, twin) is base
+    loaded = with_residual(base, twin.replace(residual=model().network.weights()))
+    assert isinstance(loaded, PReD)
+    state = random_state(torch.Generator().manual_seed(0))
+    expected = model().step(model().start(state, still_grip()), still_grip())
+    assert loaded.step(loaded.start(state, still_grip()), still_grip()).position.equal(expected.position)
