@@ -1,0 +1,222 @@
+"""The measured cables of DEFORM (arXiv 2406.05931): its npz, or the pickles of its repository, as a data set."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pred_core.bag.clouds import check_extent
+from pred_core.bag.dataset import FILE, Dataset, EpisodeEntry, file_sha256, write_dataset
+from pred_core.bag.episode import write_episode
+from pred_core.bag.pickles import read_pickled_numbers
+from pred_core.errors import BagError, DatasetError
+from pred_core.types import Episode, Grip, ObjectInfo, Tracks
+
+RATE = 100.0  # [Hz] motion capture
+SIGMA = 0.00006  # [m] marker noise, 0.05 to 0.07 mm
+SPLITS = {"train": "train", "eval": "test"}  # folder or npz name -> split
+SOURCE_FILE = "source.json"  # which file the bags were made from; an interrupted conversion goes on
+FIRST_STAMP = 1_000_000_000  # [ns] the source has no clock; 0 means "no time" in ROS
+SAME_RECORDING = 0.015  # [m] see `group_recordings`
+
+Progress = Callable[[int, int, str], None]  # done, total, name
+
+
+@dataclass(frozen=True)
+class DeformSource:
+    """Episodes of one cable as published."""
+
+    name: str
+    position: tuple[NDArray[np.float64], ...]  # each (T, V, 3) [m] world
+    split: tuple[str, ...]
+    recording: tuple[int, ...]
+    origin: tuple[str, ...]  # file names in the repository
+    digest: str  # identifies the source
+
+    @property
+    def held(self) -> dict[int, int]:
+        """Each clamped vertex (the two at each end) is a gripper of its own."""
+        count = self.position[0].shape[1]
+        return {0: 0, 1: 1, count - 2: 2, count - 1: 3}
+
+
+def read_deform(path: Path | str) -> DeformSource:
+    """Read the npz file, or a folder with train/*.pkl and eval/*.pkl. Raises: DatasetError."""
+    path = Path(path)
+    source = _read_folder(path) if path.is_dir() else _read_npz(path)
+    counts = {p.shape[1] for p in source.position}
+    if len(counts) != 1 or min(counts) < 5:
+        raise DatasetError(f"{path}: vertices per episode", got=sorted(counts), allowed="one number, at least 5")
+    for name, position in zip(source.origin, source.position, strict=True):
+        if not np.isfinite(position).all():
+            raise DatasetError(f"{path}: {name} has coordinates that are not finite", next_step="Leave it out")
+        try:
+            check_extent(position.reshape(-1, 3), name)
+        except BagError as error:
+            raise DatasetError(f"{path}: {error}") from error
+    return source
+
+
+def convert_deform(source: DeformSource, root: Path, progress: Progress) -> Dataset:
+    """Write one bag an episode and `dataset.yaml`. Finished bags of the same source are kept.
+
+    Raises: DatasetError if `root` holds something else.
+    """
+    claim_folder(root, {"source": source.name, "sha256": source.digest, "format": 1})
+    entries = []
+    total = len(source.position)
+    for i in range(total):
+        bag = f"ep{i:03d}.mcap"
+        entries.append(EpisodeEntry(bag, source.split[i], source.recording[i]))
+        if not (root / bag).exists():
+            write_episode(root / bag, deform_episode(source, i))
+        progress(i + 1, total, bag)
+    return write_dataset(
+        root, object=ObjectInfo(source.name, "line"), rate=RATE, entries=entries, sigma=SIGMA, held=source.held
+    )
+
+
+def deform_episode(source: DeformSource, index: int) -> Episode:
+    """One published episode: the clamped vertices' measured positions are the gripper positions."""
+    position = source.position[index]
+    frames, count, _ = position.shape
+    held = np.full(count, -1, np.int32)
+    for particle, gripper in source.held.items():
+        held[particle] = gripper
+    stamps = FIRST_STAMP + np.arange(frames, dtype=np.int64) * round(1e9 / RATE)
+    seen = np.ones((frames, count), bool)
+    tracks = Tracks(stamps, position, np.arange(count, dtype=np.uint32), seen, seen.astype(np.float32))
+    grips = Grip(
+        position=torch.as_tensor(position[:, list(source.held)], dtype=torch.float32),
+        rotation=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(frames, len(source.held), 1),
+        closed=torch.ones(frames, len(source.held), dtype=torch.bool),
+    )
+    return Episode(
+        name=f"ep{index:03d}",
+        object=ObjectInfo(source.name, "line"),
+        stamps=stamps,
+        tracks=tracks,
+        grips=grips,
+        held=held,
+        split=source.split[index],
+        recording=source.recording[index],
+    )
+
+
+def group_recordings(position: tuple[NDArray[np.float64], ...]) -> tuple[int, ...]:
+    """Recording index of each episode, found from the motion: the pickles do not name it.
+
+    Episodes are adjacent windows of longer recordings: the next one begins where this one, moved on by one
+    frame, ends. On both published cables adjacent windows meet within 6.5 mm and no others within 42 mm.
+    """
+    ahead = np.stack([2.0 * p[-1] - p[-2] for p in position])
+    first = np.stack([p[0] for p in position])
+    group = list(range(len(position)))
+
+    def root(i: int) -> int:
+        while group[i] != i:
+            i = group[i]
+        return i
+
+    for i, end in enumerate(ahead):
+        distance = np.linalg.norm(first - end, axis=-1).max(axis=-1)
+        distance[i] = np.inf
+        if len(distance) > 1 and distance.min() < SAME_RECORDING:
+            a, b = sorted((root(i), root(int(distance.argmin()))))
+            group[b] = a
+    numbers: dict[int, int] = {}
+    return tuple(numbers.setdefault(root(i), len(numbers)) for i in range(len(position)))
+
+
+def claim_folder(root: Path, source: dict[str, object]) -> None:
+    """Make `root` the folder of this source, or find that it already is.
+
+    Raises: DatasetError if it holds a data set of another source or other files.
+    """
+    path = root / SOURCE_FILE
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        for partial in root.glob(".*.part"):
+            partial.unlink()
+        if not path.exists():
+            if any(root.iterdir()):
+                raise DatasetError(f"{root}: not empty and not made by 'pred convert'", next_step="Use a new folder")
+            partial = root / f".{SOURCE_FILE}.part"
+            partial.write_text(json.dumps(source, indent=2) + "\n", encoding="utf-8")
+            partial.replace(path)
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{root}: cannot be used as a data set folder", got=error) from error
+    if found != source:
+        raise DatasetError(
+            f"{root}: holds the conversion of another source",
+            got=json.dumps(found),
+            allowed=json.dumps(source),
+            next_step=f"Use a new folder or remove {FILE}, {SOURCE_FILE} and the bags",
+        )
+
+
+def _read_npz(path: Path) -> DeformSource:
+    wanted = ("positions", "split", "recording_id", "source_file", "hz")
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            missing = [k for k in wanted if k not in data.files]
+            if missing:
+                raise DatasetError(f"{path}: not DEFORM data, no {', '.join(missing)}", got=", ".join(data.files))
+            positions, hz = data["positions"], float(data["hz"])
+            splits, recordings = data["split"].tolist(), data["recording_id"].tolist()
+            origin = data["source_file"].tolist()
+    except (OSError, EOFError, ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        if isinstance(error, DatasetError):
+            raise
+        raise DatasetError(f"{path}: not an npz file", got=error, next_step="Give the npz or its folder") from error
+    if positions.ndim != 4 or positions.shape[-1] != 3 or positions.dtype.kind != "f" or not len(positions):
+        raise DatasetError(f"{path}: positions", got=positions.shape, allowed="(episode, frame, vertex, 3) floats")
+    if hz != RATE:
+        raise DatasetError(f"{path}: hz", got=hz, allowed=RATE)
+    lengths = {len(positions), len(splits), len(recordings), len(origin)}
+    if len(lengths) != 1:
+        raise DatasetError(f"{path}: arrays of different lengths", got=sorted(lengths))
+    return DeformSource(
+        name=path.stem,
+        position=tuple(positions.astype(np.float64)),
+        split=tuple(_split(s, path) for s in splits),
+        recording=tuple(int(r) for r in recordings),
+        origin=tuple(origin),
+        digest=file_sha256(path),
+    )
+
+
+def _read_folder(path: Path) -> DeformSource:
+    files = [
+        f for split in SPLITS for f in sorted((path / split).glob("*.pkl"), key=lambda f: (len(f.stem), f.stem))
+    ]
+    if not files:
+        raise DatasetError(f"{path}: no episodes", got="no train/*.pkl or eval/*.pkl", next_step="Give data_set/DLO1")
+    position = tuple(np.swapaxes(read_pickled_numbers(f), 1, 2) for f in files)
+    shapes = {p.shape[1:] for p in position}
+    if len(shapes) != 1:
+        raise DatasetError(f"{path}: episodes of different cables", got=sorted(s[0] for s in shapes))
+    digest = hashlib.sha256("".join(f"{f.name} {file_sha256(f)}\n" for f in files).encode()).hexdigest()
+    return DeformSource(
+        name=f"deform_{path.resolve().name.lower()}",
+        position=position,
+        split=tuple(_split(f.parent.name, path) for f in files),
+        recording=group_recordings(position),
+        origin=tuple(f"{f.parent.name}/{f.name}" for f in files),
+        digest=digest,
+    )
+
+
+def _split(name: str, path: Path) -> str:
+    if name not in SPLITS:
+        raise DatasetError(f"{path}: unknown split", got=repr(name), allowed=", ".join(SPLITS))
+    return SPLITS[name]

@@ -1,0 +1,53 @@
+"""`pred convert`: other data formats into a data set of bags."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from pred_core.bag.deform import Progress, convert_deform, read_deform
+
+NAME = "convert"
+HELP = "Convert measured data of other projects into a data set of bags."
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `pred convert`."""
+    formats = parser.add_subparsers(dest="format", required=True, metavar="FORMAT")
+    deform = formats.add_parser("deform", help="the measured cables of DEFORM (arXiv 2406.05931)")
+    deform.add_argument("source", type=Path, help="deform_dlo1.npz, or a folder with train/*.pkl and eval/*.pkl")
+    deform.add_argument("--out", type=Path, required=True, metavar="DATASET", help="folder to write")
+    deform.set_defaults(convert=_deform)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run one conversion; interrupted and started again, it goes on where it stopped."""
+    return int(args.convert(args))
+
+
+def _deform(args: argparse.Namespace) -> int:
+    source = read_deform(args.source)
+    dataset = convert_deform(source, args.out, progress_line())
+    counts = ", ".join(f"{len(dataset.select(s))} {s}" for s in dataset.splits)
+    recordings = len(set(source.recording))
+    print(f"{dataset.root}: {len(dataset.entries)} episodes ({counts}) of {recordings} recordings")
+    print(f"data gate: pred info {dataset.root}")
+    return 0
+
+
+def progress_line() -> Progress:
+    """Prints done, total and the time left on stderr: in place on a terminal, else every tenth part."""
+    begin = time.monotonic()
+    terminal = sys.stderr.isatty()
+
+    def show(done: int, total: int, name: str) -> None:
+        left = (time.monotonic() - begin) / done * (total - done)
+        line = f"{done}/{total} {name}, about {left:.0f} s left"
+        if terminal:
+            print(f"\r{line:<60}", end="\n" if done == total else "", file=sys.stderr, flush=True)
+        elif done == total or done % max(total // 10, 1) == 0:
+            print(line, file=sys.stderr, flush=True)
+
+    return show
