@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 from pred_core.bag.deform import Progress, convert_deform, read_deform
+from pred_core.bag.sample import write_sample
 
 NAME = "convert"
 HELP = "Convert measured data of other projects into a data set of bags."
@@ -20,6 +21,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     deform.add_argument("source", type=Path, help="deform_dlo1.npz, or a folder with train/*.pkl and eval/*.pkl")
     deform.add_argument("--out", type=Path, required=True, metavar="DATASET", help="folder to write")
     deform.set_defaults(convert=_deform)
+    sample = formats.add_parser("sample", help="make the synthetic sample cable of bags/sample_cable")
+    sample.add_argument("--out", type=Path, required=True, metavar="DATASET", help="folder to write")
+    sample.set_defaults(convert=_sample)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -34,6 +38,12 @@ def _deform(args: argparse.Namespace) -> int:
     recordings = len(set(source.recording))
     print(f"{dataset.root}: {len(dataset.entries)} episodes ({counts}) of {recordings} recordings")
     print(f"data gate: pred info {dataset.root}")
+    return 0
+
+
+def _sample(args: argparse.Namespace) -> int:
+    dataset = write_sample(args.out, progress_line())
+    print(f"{dataset.root}: {len(dataset.entries)} synthetic episodes")
     return 0
 
 
