@@ -217,6 +217,7 @@ def _scene_to_mapping(scene: Scene) -> dict[str, Any]:
         "gravity": list(scene.gravity),
         "ground": scene.ground,
         "pusher_radius": scene.pusher_radius,
+        "grasp_radius": scene.grasp_radius,
         "fixtures": [],
     }
     names = {cls: name for name, cls in _FIXTURES.items()}

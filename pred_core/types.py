@@ -86,6 +86,7 @@ class Scene:
     ground: float | None = None  # [m] height of the table plane, None = no table
     fixtures: tuple[Fixture, ...] = ()
     pusher_radius: float = 0.0  # [m] an open gripper pushes particles out of this sphere; 0 = it passes
+    grasp_radius: float = 0.02  # [m] a gripper that closes takes the particles this near to its origin
 
 
 @dataclass(frozen=True)

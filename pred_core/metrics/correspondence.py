@@ -31,7 +31,7 @@ def coordinate_l1(predicted: Array, measured: Array, visible: NDArray[np.bool_] 
 def scored(measured: Array, visible: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
     """Which particles can be scored: flagged visible and with finite coordinates, (..., P)."""
     finite = np.isfinite(measured).all(axis=-1)
-    return finite if visible is None else finite & visible
+    return np.asarray(finite if visible is None else finite & visible)
 
 
 def hidden_count(measured: Array, visible: NDArray[np.bool_] | None = None) -> int:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
+from scipy.ndimage import correlate1d
 
 from pred_core.errors import InputError
 from pred_core.types import Array
@@ -63,14 +63,17 @@ def _ssim_terms(a: Array, b: Array) -> tuple[float, float]:
 
 
 def _blur(image: Array) -> Array:
-    kernel = cv2.getGaussianKernel(_WINDOW, _SIGMA, cv2.CV_64F)
+    offset = np.arange(_WINDOW) - _WINDOW // 2
+    kernel = np.exp(-0.5 * (offset / _SIGMA) ** 2)
+    kernel /= kernel.sum()
     margin = _WINDOW // 2
-    return np.asarray(cv2.sepFilter2D(image, cv2.CV_64F, kernel, kernel))[margin:-margin, margin:-margin]
+    blurred = correlate1d(correlate1d(image, kernel, axis=0), kernel, axis=1)
+    return np.asarray(blurred[margin:-margin, margin:-margin], dtype=np.float64)
 
 
 def _halve(image: Array) -> Array:
     rows, columns = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-    return image[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2).mean(axis=(1, 3))
+    return np.asarray(image[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2).mean(axis=(1, 3)))
 
 
 def _check(predicted: Array, measured: Array) -> None:

@@ -57,8 +57,6 @@ class Lpips(nn.Module):
             layer.load_state_dict({p: backbone[f"features.{i}.{p}"] for p in ("weight", "bias")})
         for index, weight in enumerate(linear):
             self.register_buffer(f"linear{index}", weight.reshape(1, -1, 1, 1))
-        self.register_buffer("shift", torch.tensor(_SHIFT).reshape(1, 3, 1, 1))
-        self.register_buffer("scale", torch.tensor(_SCALE).reshape(1, 3, 1, 1))
 
     @torch.no_grad()
     def forward(self, predicted: Tensor, measured: Tensor) -> Tensor:
@@ -69,8 +67,9 @@ class Lpips(nn.Module):
             if not bool(((image >= -1.0) & (image <= 1.0)).all()):
                 raise InputError("lpips: an image leaves its range", allowed="-1 to 1")
         lead = predicted.shape[:-3]
-        a = (predicted.reshape(-1, *predicted.shape[-3:]) - self.shift) / self.scale
-        b = (measured.reshape(-1, *measured.shape[-3:]) - self.shift) / self.scale
+        shift, scale = predicted.new_tensor(_SHIFT)[:, None, None], predicted.new_tensor(_SCALE)[:, None, None]
+        a = (predicted.reshape(-1, *predicted.shape[-3:]) - shift) / scale
+        b = (measured.reshape(-1, *measured.shape[-3:]) - shift) / scale
         total = torch.zeros(a.shape[0], dtype=a.dtype, device=a.device)
         for index, block in enumerate(self.features):
             a, b = block(a), block(b)

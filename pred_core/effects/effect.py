@@ -1,0 +1,172 @@
+"""What an effect is: one physical cause the base simulator lacks, with parameters whose null values switch it off.
+
+Every hook returns something that is *added* (a force, a tension, a friction coefficient, a displacement), so
+that null parameters reproduce the base simulator bit for bit. Physical hooks run inside the substeps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from pred_core.effects.algebra import Vec3
+from pred_core.errors import TwinError, nearest
+from pred_core.twin import Extension
+
+HOOKS = ("boundary", "inertia", "spring", "bend", "contact", "force", "observe")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of an effect; `size` > 1 for a vector, whose components share unit and bounds."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    null: float = 0.0
+    size: int = 1
+    doc: str = ""
+
+
+@dataclass(frozen=True)
+class ParticleContext:
+    """What a `force` hook may read of one particle."""
+
+    position: Vec3  # [m] world
+    velocity: Vec3  # [m/s] world
+    mass: Any  # [kg]
+    arc: Any  # material coordinate 0..1
+    time: Any  # [s] since the start of the rollout
+
+
+@dataclass(frozen=True)
+class SpringContext:
+    """What a `spring` hook may read of one spring."""
+
+    length: Any  # [m]
+    rest_length: Any  # [m]
+    rate: Any  # [m/s] growth of the length
+    stiffness: Any  # [N] per unit strain, scales included
+    damping: Any  # [N s/m], scales included
+    arc: Any  # material coordinate of its middle, 0..1
+    time: Any  # [s]
+
+
+@dataclass(frozen=True)
+class BendContext:
+    """What a `bend` hook may read of one bend of a line: two edges that meet at a particle.
+
+    Components are along two material axes that are fixed in the gripper and carried along the line.
+    """
+
+    curvature: tuple[Any, Any]  # components of the curvature binormal 2 tan(angle/2)
+    change: tuple[Any, Any]  # their change since the last substep
+    weight: Any  # [N m] bending stiffness / edge length
+    bends: Any  # number of bends of the line
+    substep: Any  # [s]
+    arc: Any  # material coordinate, 0..1
+    memory: tuple[Any, ...]  # `bend_memory` values this effect left here in the last substep; 0 at the start
+
+
+@dataclass(frozen=True)
+class ContactContext:
+    """What a `contact` hook may read of one particle near the ground."""
+
+    position: Vec3  # [m] world
+    velocity: Vec3  # [m/s] world
+    friction: Any  # coefficient, scales included
+    time: Any  # [s]
+
+
+@dataclass(frozen=True)
+class GripContext:
+    """What a `boundary` hook may read of one held particle."""
+
+    position: Vec3  # [m] world, where the gripper says it is
+    velocity: Vec3  # [m/s] world
+    lever: Vec3  # [m] world, from the gripper's origin to the particle
+    axes: tuple[Vec3, Vec3, Vec3]  # gripper axes in world
+    time: Any  # [s]
+
+
+class Effect:
+    """Base class. A subclass declares the class attributes and overrides the hooks it names in `hooks`."""
+
+    id: ClassVar[str]
+    version: ClassVar[int] = 1
+    family: ClassVar[str]
+    hooks: ClassVar[tuple[str, ...]]
+    parameters: ClassVar[tuple[Parameter, ...]]
+    confounded_with: ClassVar[tuple[str, ...]] = ()
+    bend_memory: ClassVar[int] = 0  # values a `bend` hook keeps per bend
+
+    @classmethod
+    def force(cls, p: Mapping[str, Any], at: ParticleContext) -> Vec3:
+        """Force added on a particle [N] world."""
+        raise AttributeError(f"{cls.id} has no force hook")
+
+    @classmethod
+    def spring(cls, p: Mapping[str, Any], at: SpringContext) -> Any:
+        """Tension added in a spring [N], positive pulls its ends together."""
+        raise AttributeError(f"{cls.id} has no spring hook")
+
+    @classmethod
+    def bend(cls, p: Mapping[str, Any], at: BendContext) -> tuple[Any, Any, tuple[Any, ...]]:
+        """(moment, moment) [N m] added along the two material axes, and the new memory."""
+        raise AttributeError(f"{cls.id} has no bend hook")
+
+    @classmethod
+    def bend_bound(cls, p: Mapping[str, Any]) -> tuple[float, float]:
+        """(relative stiffness added, damping time [s]) of a bend; `p` holds first components. For the substeps."""
+        return 0.0, 0.0
+
+    @classmethod
+    def contact(cls, p: Mapping[str, Any], at: ContactContext) -> tuple[Any, Any]:
+        """(friction coefficient added, ground height added [m])."""
+        raise AttributeError(f"{cls.id} has no contact hook")
+
+    @classmethod
+    def boundary(cls, p: Mapping[str, Any], at: GripContext) -> Vec3:
+        """Displacement of a held particle's target [m] world."""
+        raise AttributeError(f"{cls.id} has no boundary hook")
+
+    @classmethod
+    def inertia(cls, p: Mapping[str, Any], arc: Any) -> Any:
+        """Relative mass added, (1 + this) * mass, at material coordinate `arc`."""
+        raise AttributeError(f"{cls.id} has no inertia hook")
+
+    @classmethod
+    def null(cls) -> dict[str, tuple[float, ...]]:
+        """The parameter values that switch the effect off."""
+        return {q.name: (q.null,) * q.size for q in cls.parameters}
+
+    @classmethod
+    def extension(cls, **values: float | tuple[float, ...]) -> Extension:
+        """An `Extension` entry with these values; parameters not given are null."""
+        merged = cls.null()
+        for name, value in values.items():
+            if name not in merged:
+                raise TwinError(f"effect '{cls.id}' has no parameter '{name}'", next_step=nearest(name, merged))
+            merged[name] = tuple(np.atleast_1d(np.asarray(value, dtype=float)).tolist())
+        return Extension(cls.id, cls.version, merged)
+
+    @classmethod
+    def check(cls, extension: Extension) -> None:
+        """Raise TwinError if the values do not fit the declaration (names, sizes, bounds, version)."""
+        if extension.version != cls.version:
+            raise TwinError(f"effect '{cls.id}': version", got=extension.version, allowed=cls.version)
+        known = {q.name: q for q in cls.parameters}
+        for name in extension.parameters:
+            if name not in known:
+                raise TwinError(f"effect '{cls.id}' has no parameter '{name}'", next_step=nearest(name, known))
+        for name, q in known.items():
+            values = extension.parameters.get(name)
+            if values is None or len(values) != q.size:
+                raise TwinError(f"effect '{cls.id}': '{name}'", got=values, allowed=f"{q.size} value(s) [{q.unit}]")
+            for value in values:
+                if not (np.isfinite(value) and (value == q.null or q.low <= value <= q.high)):
+                    raise TwinError(f"effect '{cls.id}': '{name}'", got=value, allowed=f"{q.low} to {q.high} {q.unit}")

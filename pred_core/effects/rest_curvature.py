@@ -1,0 +1,31 @@
+"""A line that is naturally curved: its relaxed shape is not straight."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pred_core.effects.effect import BendContext, Effect, Parameter
+from pred_core.effects.profile import TERMS, legendre
+
+
+class RestCurvature(Effect):
+    """M = -(EI/l) k0(s): the bending moment vanishes at k0, not at zero.
+
+    k0 has two components in the material frame, each a Legendre series over the arc length. Lengths of cable
+    come off a drum curved; the set is fixed in the material and turns with the gripper.
+    """
+
+    id = "rest_curvature"
+    family = "bending"
+    hooks = ("bend",)
+    parameters = (
+        Parameter("first", "1", -1.0, 1.0, size=TERMS, doc="Legendre coefficients of k0 along the first axis"),
+        Parameter("second", "1", -1.0, 1.0, size=TERMS, doc="Legendre coefficients of k0 along the second axis"),
+    )
+    confounded_with = ("gravity_offset", "bending_hysteresis")
+
+    @classmethod
+    def bend(cls, p: Mapping[str, Any], at: BendContext) -> tuple[Any, Any, tuple[Any, ...]]:
+        first, second = legendre(p["first"], at.arc), legendre(p["second"], at.arc)
+        return -(at.weight * first), -(at.weight * second), ()

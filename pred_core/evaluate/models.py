@@ -1,0 +1,133 @@
+"""What is evaluated: twins in three stages, and the baselines. Each is rebuilt for every fold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pred_core.baselines import BlendedEnds, ConstantVelocity, LastResidual, Persistence, fit_static_regression
+from pred_core.dynamics import Dynamics
+from pred_core.errors import ConfigError, DatasetError, TwinError, nearest
+from pred_core.pred import load_dynamics
+from pred_core.twin import Twin
+from pred_core.types import Episode
+
+BASELINES = ("persistence", "constant-velocity", "blended-ends", "static-regression", "last-residual")
+Build = Callable[[Sequence[Episode], Sequence[Episode], int | None], Dynamics]
+
+
+@dataclass(frozen=True)
+class Model:
+    """`build(test, train, fold)`: the Dynamics for a fold (None: the published split).
+
+    It reads of `test` only what every start needs (period, particle count, what is held), never motion.
+    """
+
+    name: str
+    digest: str  # changes whenever predictions may change
+    build: Build
+    twin: Twin | None = None  # shown in the report
+
+
+@dataclass(frozen=True)
+class NamedTwin:
+    """A twin to evaluate; `folds` are twins fitted without each fold of the grouped split (or none)."""
+
+    name: str  # "" = the stages are called spring-mass, extended and pred
+    twin: Twin
+    folds: tuple[Twin, ...] = ()
+
+
+def twin_models(named: NamedTwin) -> list[Model]:
+    """The stages of a twin: spring-mass alone, with extensions, with the learned residual.
+
+    An unnamed twin gives one model a stage it has; a named one gives itself in full.
+    """
+    twin = named.twin
+    if named.name:
+        return [_twin_model(named.name, named, extensions=True, residual=True)]
+    models = [_twin_model("spring-mass", named, extensions=False, residual=False)]
+    if twin.extensions:
+        models.append(_twin_model("extended", named, extensions=True, residual=False))
+    if twin.residual is not None:
+        models.append(_twin_model("pred", named, extensions=True, residual=True))
+    return models
+
+
+def baseline_models(names: Sequence[str], base: NamedTwin | None) -> list[Model]:
+    """Baselines by name. `base`: the twin whose last residual is repeated.
+
+    Raises: ConfigError for an unknown name, or for last-residual without a twin.
+    """
+    return [_baseline(name, base) for name in names]
+
+
+def check_fits(twin: Twin, episode: Episode, name: str) -> None:
+    """Raise TwinError unless the twin's particles are those of the episode, in the same order."""
+    if np.array_equal(twin.body.id, episode.tracks.id):
+        return
+    raise TwinError(
+        f"twin '{name}' does not fit {episode.name}: particle ids differ",
+        got=f"{twin.body.count} particles, ids {_short(twin.body.id)}",
+        allowed=f"{len(episode.tracks.id)} particles, ids {_short(episode.tracks.id)}",
+        next_step="Identify a twin on this data set: pred identify DATASET --out TWIN",
+    )
+
+
+def _twin_model(name: str, named: NamedTwin, *, extensions: bool, residual: bool) -> Model:
+    def build(test: Sequence[Episode], train: Sequence[Episode], fold: int | None) -> Dynamics:
+        if fold is not None and fold >= len(named.folds):
+            raise TwinError(
+                f"'{name}' has no twin for fold {fold}", got=f"{len(named.folds)} fold twins",
+                next_step="Fit one without that fold's recordings and pass --fold-twins",
+            )
+        twin = named.twin if fold is None else named.folds[fold]
+        check_fits(twin, test[0], name)
+        return load_dynamics(twin, extensions=extensions, residual=residual)
+
+    digests = [t.digest() for t in (named.twin, *named.folds)]
+    return Model(name, f"{' '.join(digests)} extensions={extensions} residual={residual}", build, named.twin)
+
+
+def _baseline(name: str, base: NamedTwin | None) -> Model:
+    if name not in BASELINES:
+        raise ConfigError(f"unknown baseline '{name}'", next_step=nearest(name, BASELINES))
+    if name == "last-residual":
+        if base is None:
+            raise ConfigError("last-residual repeats the residual of a twin", next_step="Name one with --twin")
+        stage = _twin_model(f"last-residual on {base.name or 'the twin'}", base, extensions=True, residual=False)
+        return Model(name, f"{name} {stage.digest}", lambda *args: LastResidual(stage.build(*args)))
+    return Model(name, name, _BUILD[name])
+
+
+def _persistence(test: Sequence[Episode], train: Sequence[Episode], fold: int | None) -> Dynamics:
+    return Persistence(test[0].period)
+
+
+def _constant_velocity(test: Sequence[Episode], train: Sequence[Episode], fold: int | None) -> Dynamics:
+    return ConstantVelocity(test[0].period)
+
+
+def _blended_ends(test: Sequence[Episode], train: Sequence[Episode], fold: int | None) -> Dynamics:
+    if test[0].object.kind != "line":
+        raise DatasetError("blended-ends is defined for lines", got=test[0].object.kind)
+    return BlendedEnds.by_order(test[0].period, len(test[0].tracks.id))
+
+
+def _static_regression(test: Sequence[Episode], train: Sequence[Episode], fold: int | None) -> Dynamics:
+    return fit_static_regression(train)
+
+
+_BUILD: dict[str, Build] = {
+    "persistence": _persistence,
+    "constant-velocity": _constant_velocity,
+    "blended-ends": _blended_ends,
+    "static-regression": _static_regression,
+}
+
+
+def _short(ids: np.ndarray) -> str:
+    listed = ids.tolist()
+    return str(listed) if len(listed) <= 6 else f"[{listed[0]}, {listed[1]}, ..., {listed[-1]}]"

@@ -1,0 +1,129 @@
+"""The protocol: start from frames 0 and 1, then open loop to the last frame, nothing corrected on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pred_core.dynamics import Dynamics
+from pred_core.errors import DatasetError, DivergenceError, TwinError
+from pred_core.types import Array, Episode, Grip, State, stack_grips, stack_states
+
+START_FRAME = 1  # the state is measured at this frame, its velocity from this frame and the one before
+FIRST_PREDICTED = START_FRAME + 1
+PERIOD_TOLERANCE = 0.02  # relative difference of model period and frame period that clocks explain
+FARTHEST = 100.0  # [m] a particle farther than this from the origin has left the scene: diverged
+
+
+@runtime_checkable
+class UsesOneMoreFrame(Protocol):
+    """A Dynamics that also needs the frame after the start (`LastResidual`)."""
+
+    def start_after(self, before: State, grip_before: Grip, now: State, grip: Grip) -> tuple[State, Tensor]:
+        """The state started at `now`, and the base's own prediction of it."""
+
+
+def predict(dynamics: Dynamics, episodes: Sequence[Episode]) -> list[Array]:
+    """Open-loop predictions of frames 2 .. T-1 of every episode, each (T-2, P, 3) [m] world.
+
+    Episodes of equal length run as one batch. From the step at which an episode diverges its prediction is
+    NaN (see `diverged_at`); the other episodes of the batch are unaffected.
+    Raises: DatasetError for unequal particle counts or episodes shorter than three frames; TwinError if the
+    model's period is not the frame period; InputError if a particle is not measured at the start.
+    """
+    check_episodes(episodes)
+    for episode in episodes:
+        if abs(episode.period / dynamics.period - 1.0) > PERIOD_TOLERANCE:
+            raise TwinError(
+                f"{episode.name}: the model steps {dynamics.period:.5g} s but frames are {episode.period:.5g} s apart",
+                next_step="Evaluate at the rate the twin was identified at",
+            )
+    groups: dict[tuple[int, int], list[int]] = {}
+    for i, episode in enumerate(episodes):
+        groups.setdefault((len(episode.stamps), episode.grips.position.shape[1]), []).append(i)
+    predictions: dict[int, Array] = {}
+    for indices in groups.values():
+        for i, position in zip(indices, _predict_batch(dynamics, [episodes[i] for i in indices]), strict=True):
+            predictions[i] = position
+    return [predictions[i] for i in range(len(episodes))]
+
+
+def check_episodes(episodes: Sequence[Episode]) -> None:
+    """Raise DatasetError unless the episodes can be scored side by side."""
+    if not episodes:
+        raise DatasetError("no episodes to evaluate")
+    ids = episodes[0].tracks.id
+    for episode in episodes:
+        if len(episode.tracks.id) != len(ids):
+            raise DatasetError(
+                f"{episode.name}: particle count differs from {episodes[0].name}",
+                got=len(episode.tracks.id), allowed=len(ids),
+                next_step="Evaluate objects with different particles as separate data sets",
+            )
+        if not np.array_equal(episode.tracks.id, ids):
+            raise DatasetError(f"{episode.name}: particle ids differ from {episodes[0].name}")
+        if len(episode.stamps) <= FIRST_PREDICTED:
+            raise DatasetError(f"{episode.name}: too short", got=f"{len(episode.stamps)} frames",
+                               allowed=f"{FIRST_PREDICTED + 1} or more")
+
+
+def diverged_at(prediction: Array) -> int | None:
+    """The step (1 = first predicted frame) at which a prediction of `predict` stops being usable, or None."""
+    bad = ~np.isfinite(prediction).all(axis=(1, 2))
+    return int(bad.argmax()) + 1 if bad.any() else None
+
+
+def _predict_batch(dynamics: Dynamics, episodes: Sequence[Episode]) -> list[Array]:
+    """Equal lengths, equal numbers of grippers."""
+    grips = stack_grips([e.grips for e in episodes], dim=1)
+    frames = grips.position.shape[0]
+    with torch.no_grad():
+        first: Tensor | None = None
+        if isinstance(dynamics, UsesOneMoreFrame):
+            before, now = (stack_states([e.state_at(START_FRAME + k) for e in episodes]) for k in (0, 1))
+            state, predicted = dynamics.start_after(before, grips.at(START_FRAME), now, grips.at(FIRST_PREDICTED))
+            first, begin = predicted[None], FIRST_PREDICTED + 1
+        else:
+            state = stack_states([e.state_at(START_FRAME) for e in episodes])
+            state, begin = dynamics.start(state, grips.at(START_FRAME)), FIRST_PREDICTED
+        try:
+            positions = dynamics.rollout(state, grips.span(begin, frames))
+        except DivergenceError:
+            positions = _step_until_divergence(dynamics, state, grips.span(begin, frames))
+    if first is not None:
+        positions = torch.cat((first, positions))
+    whole = positions.double().numpy(force=True)
+    return [_cut(whole[:, i]) for i in range(len(episodes))]
+
+
+def _step_until_divergence(dynamics: Dynamics, state: State, grips: Grip) -> Tensor:
+    """Positions (T, B, N, 3), each world stepped on its own; NaN from the step at which a world diverges."""
+    steps, batch = grips.position.shape[0], state.position.shape[0]
+    positions = torch.full((steps, *state.position.shape), torch.nan)
+    for world in range(batch):
+        one = State(state.position[world], state.velocity[world], state.held[world],
+                    {k: v[world] for k, v in state.memory.items()})
+        for t in range(steps):
+            grip = grips.at(t)
+            try:
+                one = dynamics.step(one, Grip(grip.position[world], grip.rotation[world], grip.closed[world]))
+            except DivergenceError:
+                break
+            if not bool(torch.isfinite(one.position).all()):
+                break
+            positions[t, world] = one.position
+    return positions
+
+
+def _cut(position: Array) -> Array:
+    """The prediction with NaN from the first frame that is not finite or outside the scene."""
+    with np.errstate(invalid="ignore"):
+        bad = ~(np.abs(position) < FARTHEST).all(axis=(1, 2))
+    if bad.any():
+        position = position.copy()
+        position[int(bad.argmax()) :] = np.nan
+    return np.asarray(position)

@@ -1,0 +1,120 @@
+"""The static arrays of the kernel's `Model`, built once from Body and Scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pred_core.effects.effect import Effect
+from pred_core.frames import quaternion_normalize, quaternion_to_matrix
+from pred_core.springmass import kernel
+from pred_core.twin import Extension
+from pred_core.types import Array, Body, Box, Capsule, Fixture, Scene, Sphere
+
+_SHAPES: dict[type, int] = {Sphere: 0, Capsule: 1, Box: 2}
+
+
+@dataclass(frozen=True)
+class ModelArrays:
+    """Warp arrays that live as long as the simulator, and the scalars beside them."""
+
+    arrays: dict[str, Any]
+    scalars: dict[str, Any]
+
+    @staticmethod
+    def of(body: Body, scene: Scene, device: str) -> ModelArrays:
+        """Everything of `Model` that does not change from call to call."""
+        shapes = np.array([_SHAPES[type(f)] for f in scene.fixtures], dtype=np.int32)
+        fixtures = np.array([fixture_row(f) for f in scene.fixtures], dtype=np.float32).reshape(-1, 16)
+        floats = {
+            "spring_data": spring_rows(body),
+            "bend_data": bend_rows(body),
+            "particle_data": np.stack((body.friction_scale, body.arc), axis=1),
+            "fixture_data": fixtures,
+        }
+        integers = {"springs": body.springs, "bends": bend_entries(body), "fixture_shape": shapes, "pairs": shapes[:0]}
+        arrays = {k: wp.array(v.astype(np.float32).ravel(), dtype=wp.float32, device=device) for k, v in floats.items()}
+        arrays |= {k: wp.array(v.astype(np.int32).ravel(), dtype=wp.int32, device=device) for k, v in integers.items()}
+        gx, gy, gz = scene.gravity
+        scalars = {
+            "particles": body.count,
+            "spring_count": len(body.springs),
+            "bend_count": len(body.bends),
+            "fixture_count": len(shapes),
+            "pair_count": 0,
+            "has_ground": int(scene.ground is not None),
+            "ground": scene.ground or 0.0,
+            "gravity_x": gx,
+            "gravity_y": gy,
+            "gravity_z": gz,
+            "radius": body.radius,
+            "pusher_radius": scene.pusher_radius,
+            "contact_distance": 2.0 * body.radius,
+        }
+        return ModelArrays(arrays, scalars)
+
+    def model(self) -> Any:
+        """A fresh `Model` struct with these values; the caller fills in what belongs to one call."""
+        model = kernel.Model()
+        for name, value in (*self.arrays.items(), *self.scalars.items()):
+            setattr(model, name, value)
+        return model
+
+
+def spring_rows(body: Body) -> Array:
+    """(S, 5): 1/l0, l0, stiffness scale, damping scale, arc of the middle."""
+    arc = body.arc[body.springs].mean(axis=1)
+    return np.stack((1.0 / body.rest_length, body.rest_length, body.stiffness_scale, body.damping_scale, arc), axis=1)
+
+
+def bend_rows(body: Body) -> Array:
+    """(B, 4): scale/lbar, lbar [m] (half of the two edges), arc, share of the line's twist."""
+    if len(body.bends) == 0:
+        return np.zeros((0, 4))
+    rest = {tuple(p): length for p, length in zip(body.springs.tolist(), body.rest_length.tolist(), strict=True)}
+
+    def edge(a: int, b: int) -> float:
+        fallback = float(np.linalg.norm(body.rest_position[b] - body.rest_position[a]))
+        return rest.get((min(a, b), max(a, b)), fallback)
+
+    lbar = np.array([0.5 * (edge(a, b) + edge(b, c)) for a, b, c in body.bends.tolist()])
+    return np.stack((body.bend_scale / lbar, lbar, body.arc[body.bends[:, 1]], lbar / lbar.sum()), axis=1)
+
+
+def bend_entries(body: Body) -> NDArray[np.int32]:
+    """(B, 4): before, at, after, 1 where the bend does not continue the one before it in the list."""
+    starts = np.ones(len(body.bends), dtype=np.int32)
+    if len(body.bends) > 1:
+        starts[1:] = ~(body.bends[1:, :2] == body.bends[:-1, 1:]).all(axis=1)
+    return np.concatenate((body.bends, starts[:, None]), axis=1).astype(np.int32)
+
+
+def fixture_row(fixture: Fixture) -> list[float]:
+    """16 numbers as `source.CONTACT` reads them."""
+    if isinstance(fixture, Sphere):
+        row = [*fixture.center, *fixture.center, fixture.radius]
+    elif isinstance(fixture, Capsule):
+        row = [*fixture.start, *fixture.end, fixture.radius]
+    else:
+        world_from_box = quaternion_to_matrix(quaternion_normalize(torch.tensor(fixture.rotation, dtype=torch.float64)))
+        row = [*fixture.center, *fixture.half_size, *world_from_box.T.flatten().tolist()]
+    return row + [0.0] * (16 - len(row))
+
+
+def mass_of_worlds(body: Body, per_world: list[tuple[Extension, ...]], effects: tuple[type[Effect], ...]) -> Tensor:
+    """(W, N) [kg]: the body's masses with every `inertia` hook applied."""
+    arc = torch.as_tensor(body.arc)
+    rows = []
+    for extensions in per_world:
+        factor = torch.ones_like(arc)
+        for effect, extension in zip(effects, extensions, strict=True):
+            if "inertia" in effect.hooks:
+                factor = factor + effect.inertia(extension.parameters, arc)
+        rows.append(torch.as_tensor(body.mass) * factor)
+    return torch.stack(rows).to(torch.float32)
