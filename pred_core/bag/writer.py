@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 from pred_core.bag.wire import TYPES, bare_topic, encode, typestore
 from pred_core.errors import BagError
 
-CHUNK_SIZE = 1 << 18  # [bytes] before compression; what a reader and the writer hold in memory
+CHUNK_SIZE = 1 << 16  # [bytes] before compression; what reader and writer hold, and what a cut file loses
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}  # how rosbag2 writes an infinite duration
 
 
