@@ -1,0 +1,23 @@
+"""Quadratic air drag."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pred_core.effects.algebra import Vec3
+from pred_core.effects.effect import Effect, Parameter, ParticleContext
+
+
+class DragQuadratic(Effect):
+    """f = -m b |v| v: drag of a body in turbulent flow."""
+
+    id = "drag_quadratic"
+    family = "drag"
+    hooks = ("force",)
+    parameters = (Parameter("coefficient", "1/m", 0.0, 50.0, doc="b, drag per mass and squared speed"),)
+    confounded_with = ("drag_linear", "wind")
+
+    @classmethod
+    def force(cls, p: Mapping[str, Any], at: ParticleContext) -> Vec3:
+        return at.velocity * (-p["coefficient"][0] * at.mass * at.velocity.norm())
