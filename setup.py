@@ -14,6 +14,7 @@ NODES = ("player", "predictor", "evaluator")
 CORE = [
     "cma",
     "jinja2",
+    "lz4",
     "matplotlib",
     "mcap",
     "numpy",
@@ -23,6 +24,7 @@ CORE = [
     "scipy",
     "torch",
     "warp-lang",
+    "zstandard",
 ]
 EXTRAS = {
     "ros": ["ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"],

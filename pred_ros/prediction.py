@@ -1,0 +1,355 @@
+"""Tracks and gripper poses in, predictions out: the predictor's bookkeeping, without ROS.
+
+A run starts from the first two complete tracker frames (the velocity is their difference) and then steps once
+for each period of measured gripper poses: exactly what the offline evaluation does, message by message.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pred_core.bag.align import slerp
+from pred_core.bag.clouds import PointFrame
+from pred_core.bag.episode import GRASP_RADIUS
+from pred_core.bag.grippers import PoseFrame
+from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
+from pred_core.dynamics import Dynamics
+from pred_core.errors import DivergenceError, InputError, TwinError
+from pred_core.types import Grip, State
+
+ON_GRID = 0.25  # periods; a pose this close to the next step is taken as it is
+MAX_WAITING = 4_000  # tracker frames kept while poses are awaited
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How the predictor treats time. `period` [s] is the twin's."""
+
+    max_gap: float = 0.1  # [s] between two poses; a longer hole ends the run
+    horizon: float = 0.0  # [s] predicted beyond the newest pose, the gripper moving on at its last velocity
+    correct: str = "none"  # none: open loop from the start | tracks: restart from what every frame measured
+
+
+@dataclass(frozen=True)
+class Pose:
+    """One measured gripper pose with the closed flags that held when it arrived."""
+
+    pose: PoseFrame
+    closed: NDArray[np.bool_]  # (G,)
+    lap: int  # counts jumps back in time
+
+    @property
+    def time(self) -> tuple[int, int]:
+        """(lap, stamp [ns]): grows along the stream."""
+        return self.lap, self.pose.stamp
+
+    def grip(self) -> Grip:
+        """As the simulator reads it."""
+        return _grip(self.pose.position, self.pose.rotation, self.closed)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What one step gave."""
+
+    stamp: int  # [ns] of the newest measured pose used
+    state: State  # at `stamp`
+    ahead_stamp: int  # [ns] stamp + horizon
+    ahead: State  # at `ahead_stamp`
+
+
+@dataclass
+class Counts:
+    """What happened so far; shown in the diagnostics."""
+
+    runs: int = 0
+    steps: int = 0
+    interpolated: int = 0  # steps whose pose lay between two measured ones
+    unused_poses: int = 0  # faster than the period
+    gaps: int = 0  # holes in the poses that ended a run
+    jumps: int = 0  # jumps back in time
+    dropped_frames: int = 0  # tracker frames that waited too long for poses
+    waiting_for: list[int] = field(default_factory=list)  # particle ids a start lacks
+    spacing: float = 1.0  # periods between the two frames that were last refused as a start
+
+
+class Predictor:
+    """Feed `add_points` and `add_pose` in order of arrival; `advance` gives what can be predicted now."""
+
+    def __init__(self, dynamics: Dynamics, ids: NDArray[np.uint32], held: Mapping[int, int] | None, rules: Rules):
+        self._dynamics = dynamics
+        self._ids = np.asarray(ids, np.uint32)
+        self._held = held
+        self._rules = rules
+        self._period = round(dynamics.period * 1e9)  # [ns]
+        self._frames: deque[tuple[tuple[int, int], PointFrame]] = deque()
+        self._poses: deque[Pose] = deque()
+        self._frame_lap = self._pose_lap = 0
+        self._newest_frame = self._newest_pose = -(2**62)  # [ns]
+        self._state: State | None = None
+        self._time: tuple[int, int] = (-1, 0)  # of the state
+        self._begin: tuple[int, int] = (-1, 0)  # frames before it belong to what is over
+        self._before: Pose | None = None  # the last pose at or before the state's next time
+        self.halted: DivergenceError | None = None
+        self.counts = Counts()
+
+    @property
+    def running(self) -> bool:
+        """True once a run has started and not ended."""
+        return self._state is not None
+
+    @property
+    def backlog(self) -> float:
+        """[s] of poses that wait to be stepped over."""
+        return len(self._poses) * self._dynamics.period if self.running else 0.0
+
+    def reset(self) -> None:
+        """End the run; the next one starts from the tracker frames that follow."""
+        self._state = self._before = None
+        self.halted = None
+        self._frames.clear()
+        self._poses.clear()
+
+    def add_points(self, frame: PointFrame) -> None:
+        """A tracker frame. Raises: TwinError if it has particles the twin does not know."""
+        unknown = np.setdiff1d(frame.id, self._ids)
+        if len(unknown) or not len(frame.id):
+            raise TwinError(
+                "the particle ids of tracker/points do not match the twin",
+                got=f"{len(unknown)} unknown ids, e.g. {unknown[:5].tolist()}",
+                allowed=f"{len(self._ids)} ids, {self._ids.min()} to {self._ids.max()}",
+                next_step="Give the twin that was identified on this object's tracks",
+            )
+        if self._jumped(TRACKER_POINTS, frame.stamp, self._newest_frame):
+            self._frame_lap += 1
+        self._newest_frame = frame.stamp
+        self._frames.append(((self._frame_lap, frame.stamp), frame))
+        if len(self._frames) > MAX_WAITING:
+            self._frames.popleft()
+            self.counts.dropped_frames += 1
+
+    def add_pose(self, pose: PoseFrame, closed: NDArray[np.bool_]) -> None:
+        """A gripper pose. Raises: InputError if the flags do not match or a held particle has no gripper."""
+        count = len(pose.position)
+        if len(closed) != count:
+            raise InputError(
+                f"{GRIPPER_CLOSED} does not match {GRIPPER_POSE}", got=f"{len(closed)} flags", allowed=count
+            )
+        needed = max(self._held.values(), default=-1) + 1 if self._held else 0
+        if count < needed:
+            raise InputError(f"{GRIPPER_POSE}: too few grippers for 'held'", got=count, allowed=f"{needed} or more")
+        if self._jumped(GRIPPER_POSE, pose.stamp, self._newest_pose):
+            self._pose_lap += 1
+            self.counts.jumps += 1
+        self._newest_pose = pose.stamp
+        self._poses.append(Pose(pose, closed, self._pose_lap))
+
+    def advance(self) -> Iterable[Prediction]:
+        """Predictions that the data so far allow, oldest first.
+
+        Raises: DivergenceError when the simulation leaves the finite numbers; the run is then halted
+        until `reset` or a jump or gap in the poses.
+        """
+        while self._poses:
+            if self._state is None:
+                if self.halted is not None:
+                    if not self._ends_run(self._poses[0]):
+                        self._before = self._poses.popleft()
+                        continue
+                    self._end_run(self._poses[0])
+                if not self._start():
+                    return
+                continue
+            pose = self._poses[0]
+            if self._ends_run(pose):
+                self._end_run(pose)
+                continue
+            prediction = self._step(self._poses.popleft())
+            if prediction is not None:
+                yield prediction
+
+    def _jumped(self, topic: str, stamp: int, newest: int) -> bool:
+        """True for a jump back in time (a loop). Raises: InputError if a message is merely late or repeated."""
+        if stamp > newest:
+            return False
+        if newest - stamp <= self._rules.max_gap * 1e9:
+            raise InputError(
+                f"{topic}: time runs backwards", got=f"stamp {stamp * 1e-9:.6f} s after {newest * 1e-9:.6f} s"
+            )
+        return True
+
+    def _ends_run(self, pose: Pose) -> bool:
+        if self._before is None:
+            return False
+        lap, stamp = self._before.time
+        return pose.lap != lap or pose.pose.stamp - stamp > self._rules.max_gap * 1e9
+
+    def _end_run(self, pose: Pose) -> None:
+        if self._before is not None and pose.lap == self._before.lap:
+            self.counts.gaps += 1
+        self._state = self._before = None
+        self.halted = None
+        self._begin = (pose.lap, pose.pose.stamp - self._period // 2)
+
+    def _start(self) -> bool:
+        """Start from the oldest two complete neighbouring frames that have a pose. False: more data needed."""
+        while self._frames and self._frames[0][0] < self._begin:
+            self._frames.popleft()
+        while len(self._frames) >= 2:
+            (lap, first_stamp), first = self._frames[0]
+            time, second = self._frames[1]
+            missing = self._missing(first) | self._missing(second)
+            spacing = (second.stamp - first_stamp) / self._period
+            if missing or time[0] != lap or abs(spacing - 1.0) > ON_GRID:
+                self.counts.waiting_for = sorted(missing)
+                self.counts.spacing = spacing
+                self._frames.popleft()
+                continue
+            self.counts.waiting_for, self.counts.spacing = [], 1.0
+            return self._start_at(time, first, second)
+        return False
+
+    def _start_at(self, time: tuple[int, int], first: PointFrame, second: PointFrame) -> bool:
+        while self._poses and self._poses[0].time < (time[0], time[1] - round(ON_GRID * self._period)):
+            self._before = self._poses.popleft()
+        if not self._poses:
+            return False
+        pose = self._poses[0]
+        if pose.lap != time[0] or pose.pose.stamp - time[1] > ON_GRID * self._period:
+            if self._before is None or self._before.lap != time[0] or self._ends_run(pose):
+                self._frames.popleft()  # the poses begin later: this pair cannot be used
+                return bool(self._frames) and len(self._frames) >= 2
+            grip, pose = self._between(self._before, pose, time[1]), self._before
+        else:
+            grip, pose = pose.grip(), self._poses.popleft()
+        order = np.argsort(second.id)[np.searchsorted(np.sort(second.id), self._ids)]
+        earlier = np.argsort(first.id)[np.searchsorted(np.sort(first.id), self._ids)]
+        now, before = second.position[order], first.position[earlier]
+        dt = (second.stamp - first.stamp) * 1e-9
+        state = State(
+            position=torch.as_tensor(now, dtype=torch.float32),
+            velocity=torch.as_tensor((now - before) / dt, dtype=torch.float32),
+            held=torch.as_tensor(self._held_by(before, self._grip_near(first.stamp, grip)), dtype=torch.int32),
+        )
+        self._state = self._dynamics.start(state, grip)
+        self._time, self._before = time, pose
+        self.counts.runs += 1
+        self._prune()
+        return True
+
+    def _step(self, pose: Pose) -> Prediction | None:
+        assert self._state is not None and self._before is not None
+        next_stamp = self._time[1] + self._period
+        offset = pose.pose.stamp - next_stamp
+        if offset < -ON_GRID * self._period:
+            self.counts.unused_poses += 1
+            self._before = pose
+            return None
+        if offset > ON_GRID * self._period:
+            self._poses.appendleft(pose)
+            self.counts.interpolated += 1
+            grip, stamp, last = self._between(self._before, pose, next_stamp), next_stamp, self._before
+        else:
+            grip, stamp, last = pose.grip(), pose.pose.stamp, pose
+        begin = self._corrected(self._state) if self._rules.correct == "tracks" else self._state
+        previous, self._before = self._before, last
+        state = self._stepped(begin, grip, stamp)
+        self.counts.steps += 1
+        self._state, self._time = state, (pose.lap, stamp)
+        self._prune()
+        return self._ahead(stamp, state, grip, previous)
+
+    def _stepped(self, state: State, grip: Grip, stamp: int) -> State:
+        """One step that must stay finite. Raises: DivergenceError; the run is over then."""
+        try:
+            after = self._dynamics.step(state, grip)
+            if bool(torch.isfinite(after.position).all() and torch.isfinite(after.velocity).all()):
+                return after
+            reason = "not finite"
+        except DivergenceError as error:
+            reason = str(error)
+        self._state = None
+        self.halted = DivergenceError(
+            f"the simulation diverged at stamp {stamp * 1e-9:.3f} s",
+            got=reason,
+            next_step="Check the twin and the gripper pose; ~/reset starts again",
+        )
+        raise self.halted
+
+    def _ahead(self, stamp: int, state: State, grip: Grip, previous: Pose) -> Prediction:
+        count = round(self._rules.horizon / self._dynamics.period)
+        if count == 0:
+            return Prediction(stamp, state, stamp, state)
+        elapsed = max(stamp - previous.pose.stamp, 1) * 1e-9
+        velocity = (grip.position - torch.as_tensor(previous.pose.position, dtype=torch.float32)) / elapsed
+        ahead = state
+        for k in range(1, count + 1):
+            moved = Grip(grip.position + velocity * (k * self._dynamics.period), grip.rotation, grip.closed)
+            ahead = self._stepped(ahead, moved, stamp + k * self._period)
+        return Prediction(stamp, state, stamp + count * self._period, ahead)
+
+    def _corrected(self, state: State) -> State:
+        """Particles measured at the state's time (and one frame before) take their measured place and velocity."""
+        frames = [f for t, f in self._frames if t[0] == self._time[0]]
+        now = next((f for f in frames if abs(f.stamp - self._time[1]) <= ON_GRID * self._period), None)
+        if now is None:
+            return state
+        before = next((f for f in reversed(frames) if 0 < now.stamp - f.stamp < 1.5 * self._period), None)
+        if before is None:
+            return state
+        position, velocity = state.position.clone(), state.velocity.clone()
+        column = {int(i): k for k, i in enumerate(self._ids)}
+        earlier = {int(i): p for i, p, v in zip(before.id, before.position, before.visible, strict=True) if v}
+        dt = (now.stamp - before.stamp) * 1e-9
+        for i, p, seen in zip(now.id, now.position, now.visible, strict=True):
+            if seen and int(i) in earlier:
+                k = column[int(i)]
+                position[k] = torch.as_tensor(p, dtype=torch.float32)
+                velocity[k] = torch.as_tensor((p - earlier[int(i)]) / dt, dtype=torch.float32)
+        return state.replace(position=position, velocity=velocity)
+
+    def _prune(self) -> None:
+        """Forget tracker frames that lie more than one period before the state."""
+        while self._frames and self._frames[0][0] < (self._time[0], self._time[1] - round(1.4 * self._period)):
+            self._frames.popleft()
+
+    def _missing(self, frame: PointFrame) -> set[int]:
+        return set(self._ids.tolist()) - set(frame.id[frame.visible].tolist())
+
+    def _held_by(self, position: NDArray[np.float64], grip: Grip) -> NDArray[np.int32]:
+        held = np.full(len(self._ids), -1, np.int32)
+        if self._held is not None:
+            for particle, gripper in self._held.items():
+                held[self._ids == particle] = gripper
+            return held
+        distance = np.linalg.norm(position[:, None] - grip.position.double().numpy()[None], axis=-1)
+        distance[:, ~grip.closed.numpy()] = np.inf
+        near = distance.min(axis=1) <= GRASP_RADIUS
+        held[near] = distance.argmin(axis=1)[near]
+        return held
+
+    def _grip_near(self, stamp: int, otherwise: Grip) -> Grip:
+        """The gripper at the first frame of a run, where the pose then was measured."""
+        if self._before is None or abs(self._before.pose.stamp - stamp) > ON_GRID * self._period:
+            return otherwise
+        return self._before.grip()
+
+    def _between(self, a: Pose, b: Pose, stamp: int) -> Grip:
+        weight = (stamp - a.pose.stamp) / (b.pose.stamp - a.pose.stamp)
+        position = a.pose.position + weight * (b.pose.position - a.pose.position)
+        rotation = slerp(a.pose.rotation, b.pose.rotation, np.full(len(position), weight))
+        return _grip(position, rotation, a.closed)
+
+
+def _grip(position: NDArray[np.float64], rotation: NDArray[np.float64], closed: NDArray[np.bool_]) -> Grip:
+    return Grip(
+        torch.as_tensor(position, dtype=torch.float32),
+        torch.as_tensor(rotation, dtype=torch.float32),
+        torch.as_tensor(closed),
+    )

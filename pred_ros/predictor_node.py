@@ -1,0 +1,298 @@
+"""The predictor: loads a twin, takes tracker/points and the measured gripper, publishes what comes next.
+
+In: tracker/points, gripper/pose, gripper/closed. Out: state/points (at the newest pose), prediction/points
+(`horizon` later). `~/reset` (Trigger) starts anew from the next tracker frames.
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from geometry_msgs.msg import PoseArray
+from numpy.typing import NDArray
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import UInt8MultiArray
+from std_srvs.srv import Trigger
+
+from pred_core.bag.clouds import PointFrame
+from pred_core.bag.grippers import PoseFrame
+from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, PREDICTION_POINTS, STATE_POINTS, TRACKER_POINTS
+from pred_core.config import setting
+from pred_core.dynamics import Dynamics
+from pred_core.errors import ConfigError, DivergenceError, PredError, TwinError
+from pred_core.twin import Twin
+from pred_ros import convert, qos
+from pred_ros.diagnostics import ERROR, OK, WARN
+from pred_ros.prediction import Predictor, Rules
+from pred_ros.shell import Shell, run
+
+REFUSED_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
+
+
+@dataclass(frozen=True)
+class PredictorConfig:
+    """Parameters of the predictor."""
+
+    twin: str = setting("", doc="folder of the twin")
+    held: str = setting("", doc="particle:gripper pairs, e.g. '0:0 1:1'; empty: by distance to a closed gripper")
+    horizon: float = setting(0.0, unit="s", low=0.0, high=5.0, doc="predicted beyond the newest gripper pose")
+    correct: str = setting("none", choices=("none", "tracks"), doc="open loop, or restart from every measured frame")
+    max_gap: float = setting(
+        0.1, unit="s", low=0.001, high=10.0, doc="longest hole in gripper/pose; beyond it, no prediction"
+    )
+    overload: str = setting(
+        "newest", choices=("newest", "queue"), doc="when too slow: restart at newest data, or keep all"
+    )
+    max_backlog: float = setting(0.5, unit="s", low=0.01, high=60.0, doc="backlog that counts as too slow")
+    wait_for: int = setting(0, low=0, high=64, doc="readers of prediction/points to wait for before subscribing")
+    threads: int = setting(1, low=1, high=64, doc="torch threads")
+    autostart: bool = setting(True, doc="configure and activate without a lifecycle manager")
+
+
+def parse_held(text: str) -> dict[int, int] | None:
+    """'0:0 11:2' -> {0: 0, 11: 2}; '' -> None. Raises: ConfigError."""
+    try:
+        pairs = [tuple(int(x) for x in item.split(":")) for item in text.replace(",", " ").split()]
+        held = {particle: gripper for particle, gripper in pairs}
+    except ValueError as error:
+        raise ConfigError("parameter 'held'", got=repr(text), allowed="pairs like '0:0 1:1 11:2'") from error
+    if any(p < 0 or g < 0 for p, g in held.items()):
+        raise ConfigError("parameter 'held'", got=repr(text), allowed="ids and gripper indices of 0 or more")
+    return held or None
+
+
+def load_dynamics_of(twin: Twin) -> Dynamics:
+    """The Dynamics a twin describes. Imported late: it pulls in the simulator."""
+    from pred_core.pred import load_dynamics
+
+    return load_dynamics(twin)
+
+
+class PredictorNode(Shell):
+    """Messages go through an inbox to one worker thread, which owns the `Predictor`."""
+
+    NAME: ClassVar[str] = "predictor"
+    CONFIG: ClassVar[type] = PredictorConfig
+    MAKE_DYNAMICS: ClassVar[Callable[[Twin], Dynamics]] = staticmethod(load_dynamics_of)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._inbox: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._worker: Future[None] | None = None
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="prediction")
+        self._inputs: list[Subscription] = []
+        self._closed: NDArray[np.bool_] | None = None
+        self._refused = ""
+
+    def setup(self) -> None:
+        """Load the twin."""
+        config: PredictorConfig = self.config
+        if not config.twin:
+            raise TwinError(
+                "parameter 'twin' is empty", next_step="ros2 run pred_ros predictor --ros-args -p twin:=FOLDER"
+            )
+        torch.set_num_threads(config.threads)
+        self._twin = Twin.load(Path(config.twin))
+        self._ids = self._twin.body.id
+        held = parse_held(config.held)
+        if held is not None and (unknown := sorted(set(held) - set(self._ids.tolist()))):
+            raise TwinError("parameter 'held' names particles the twin does not have", got=unknown[:5])
+        self._dynamics = type(self).MAKE_DYNAMICS(self._twin)
+        self._held = held
+        self._state_out = self.create_publisher(PointCloud2, STATE_POINTS, qos.points_complete())
+        self._prediction_out = self.create_publisher(PointCloud2, PREDICTION_POINTS, qos.points_complete())
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.report(WARN, f"twin {config.twin} loaded; waiting for {TRACKER_POINTS} and {GRIPPER_POSE}")
+
+    def start(self) -> None:
+        """Begin: a fresh Predictor, a worker, and subscriptions once enough readers listen."""
+        config: PredictorConfig = self.config
+        rules = Rules(max_gap=config.max_gap, horizon=config.horizon, correct=config.correct)
+        self._predictor = Predictor(self._dynamics, self._ids, self._held, rules)
+        self._inbox = queue.SimpleQueue()
+        self._worker = self._pool.submit(self._work)
+        self._starter = self.create_timer(0.02, self._subscribe_when_heard)
+        self._watch = self.create_timer(0.05, self._check_worker)
+
+    def stop(self) -> None:
+        """End the worker; what waits in the inbox is not predicted any more."""
+        if self._worker is None:
+            return
+        self._worker = None
+        for subscription in self._inputs:
+            self.destroy_subscription(subscription)
+        for timer in (self._starter, self._watch):
+            self.destroy_timer(timer)
+        self._inputs = []
+        self._stopping = True
+        self._inbox.put(None)
+        self._pool.shutdown(wait=True)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="prediction")
+
+    def changed(self, config: PredictorConfig) -> None:
+        """Everything but the thresholds is fixed while the node runs."""
+        parse_held(config.held)
+        names = ("twin", "held", "horizon", "correct", "max_gap", "wait_for", "threads", "autostart")
+        fixed = [n for n in names if getattr(config, n) != getattr(self.config, n)]
+        if fixed and self._worker is not None:
+            raise ConfigError(
+                f"'{fixed[0]}' cannot change while the node is active", next_step="Deactivate the node first"
+            )
+
+    def heartbeat(self) -> None:
+        """Judge ages and counters."""
+        if self._worker is None:
+            return
+        counts = self._predictor.counts
+        for name in ("runs", "steps", "interpolated", "unused_poses", "gaps", "jumps", "dropped_frames"):
+            self.diagnostics.value(name, str(getattr(counts, name)))
+        self.diagnostics.value("waiting inbox", str(self._inbox.qsize()))
+        age, frame_age = self.diagnostics.age(GRIPPER_POSE), self.diagnostics.age(TRACKER_POINTS)
+        refused_age = self.diagnostics.age("refused message")
+        limit = max(self.config.max_gap, 0.2)
+        if self._predictor.halted is not None:
+            self.report(ERROR, str(self._predictor.halted))
+        elif refused_age is not None and refused_age < REFUSED_SHOWN:
+            self.report(ERROR, self._refused)
+        elif age is None or age > limit:
+            since = "never came" if age is None else f"stopped {age:.1f} s ago"
+            self.report(
+                ERROR if frame_age is not None and frame_age < limit else WARN, f"{GRIPPER_POSE} {since}: no prediction"
+            )
+        elif self._closed is None:
+            self.report(ERROR, f"{GRIPPER_CLOSED} never came: no prediction")
+        elif not self._predictor.running:
+            missing = counts.waiting_for
+            detail = "no complete pair of frames yet"
+            if missing:
+                detail = f"particles {missing[:5]} are not seen"
+            elif counts.spacing != 1.0:
+                period = self._dynamics.period
+                detail = f"frames come {counts.spacing * period:.4g} s apart, the twin steps {period:g} s"
+            self.report(WARN, f"waiting for a start: {detail}")
+        else:
+            self.report(OK, "predicting")
+
+    def _subscribe_when_heard(self) -> None:
+        if self._inputs or self._prediction_out.get_subscription_count() < self.config.wait_for:
+            return
+        complete = qos.points_complete()
+        self._inputs = [
+            self.create_subscription(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed, complete),
+            self.create_subscription(PoseArray, GRIPPER_POSE, self._on_pose, complete),
+            self.create_subscription(PointCloud2, TRACKER_POINTS, self._on_points, complete),
+        ]
+        self._starter.cancel()
+
+    def _check_worker(self) -> None:
+        if self._worker is None or not self._worker.done():
+            return
+        try:
+            self._worker.result()  # raises what ended the worker; a bug ends the process with its trace
+        except PredError as error:
+            self.fail(error)
+
+    def _on_closed(self, message: UInt8MultiArray) -> None:
+        self._take(GRIPPER_CLOSED, lambda: self._set_closed(convert.message_to_closed(message)))
+
+    def _on_pose(self, message: PoseArray) -> None:
+        self._take(GRIPPER_POSE, lambda: self._post(self._add_pose, convert.message_to_pose(message), self._closed))
+
+    def _on_points(self, message: PointCloud2) -> None:
+        self._take(TRACKER_POINTS, lambda: self._post(self._add_points, convert.cloud_to_points(message)))
+
+    def _set_closed(self, closed: NDArray[np.bool_]) -> None:
+        self._closed = closed
+
+    def _post(self, action: Callable[..., None], *values: object) -> None:
+        self._inbox.put(lambda: action(*values))
+
+    def _take(self, topic: str, action: Callable[[], None]) -> None:
+        self.diagnostics.seen(topic)
+        self.diagnostics.count(f"messages on {topic}")
+        try:
+            action()
+        except PredError as error:
+            self._refuse(error)
+
+    def _refuse(self, error: PredError) -> None:
+        self._refused = f"refused: {error}"
+        self.diagnostics.seen("refused message")
+        self.diagnostics.count("refused messages")
+        self.report(ERROR, self._refused)
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._post(self._reset)
+        response.success, response.message = True, "starting anew from the next tracker frames"
+        return response
+
+    # Below: the worker thread. It alone touches the Predictor's state.
+
+    def _work(self) -> None:
+        self._stopping = False
+        while not self._stopping and (action := self._inbox.get()) is not None:
+            try:
+                action()
+            except TwinError:
+                raise
+            except DivergenceError as error:
+                self.diagnostics.count("divergences")
+                self.report(ERROR, str(error))
+            except PredError as error:
+                self._refuse(error)
+
+    def _reset(self) -> None:
+        self._predictor.reset()
+        self.diagnostics.count("resets")
+
+    def _add_points(self, frame: PointFrame) -> None:
+        self._predictor.add_points(frame)
+        self._advance()
+
+    def _add_pose(self, pose: PoseFrame, closed: NDArray[np.bool_] | None) -> None:
+        if closed is None:
+            self.diagnostics.count("poses before the first gripper/closed")
+            return
+        if (
+            self.config.overload == "newest"
+            and self._inbox.qsize() * self._dynamics.period > 2 * self.config.max_backlog
+        ):
+            self._drop_to_newest()
+        self._predictor.add_pose(pose, closed)
+        self._advance()
+
+    def _drop_to_newest(self) -> None:
+        dropped = 0
+        while not self._inbox.empty():
+            if self._inbox.get_nowait() is None:
+                self._stopping = True
+                return
+            dropped += 1
+        self._predictor.reset()
+        self.diagnostics.count("dropped messages", dropped)
+        self.report(WARN, f"too slow: {dropped} messages dropped, starting anew from the newest data")
+
+    def _advance(self) -> None:
+        for prediction in self._predictor.advance():
+            self._state_out.publish(convert.state_to_cloud(prediction.stamp, self._ids, prediction.state))
+            ahead = convert.state_to_cloud(prediction.ahead_stamp, self._ids, prediction.ahead)
+            self._prediction_out.publish(ahead)
+            self.diagnostics.count("predictions")
+
+
+def main() -> int:
+    """Entry point of `ros2 run pred_ros predictor`."""
+    return run(PredictorNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

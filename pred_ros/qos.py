@@ -1,0 +1,38 @@
+"""Every quality-of-service profile in one place. Reliable writers serve reliable and best-effort readers alike."""
+
+from __future__ import annotations
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+LIVE_DEPTH = 5
+# Deep enough for the longest backlog of a scored replay (20 s at 500 Hz); memory follows what is queued.
+COMPLETE_DEPTH = 10_000
+
+
+def points_live() -> QoSProfile:
+    """Readers that want the newest points: RVIZ, a planner. A slow one loses the oldest."""
+    return _profile(LIVE_DEPTH, DurabilityPolicy.VOLATILE)
+
+
+def points_complete() -> QoSProfile:
+    """Writers of points and poses, and readers that must not lose one (predictor, evaluator)."""
+    return _profile(COMPLETE_DEPTH, DurabilityPolicy.VOLATILE)
+
+
+def command() -> QoSProfile:
+    """Commands: only the newest counts; the reader's watchdog judges its age."""
+    return _profile(1, DurabilityPolicy.VOLATILE)
+
+
+def latched(depth: int = 1) -> QoSProfile:
+    """What a late reader must still get: gripper/closed, episode marks, camera poses, goals."""
+    return _profile(depth, DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=durability,
+    )

@@ -1,0 +1,159 @@
+"""What every node shares: parameters, lifecycle with autostart, diagnostics, signals, exit code.
+
+A node is a subclass of `Shell` with three methods (`setup`, `start`, `stop`); its `main` is `run(TheNode)`.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from typing import Any, ClassVar, Protocol, cast
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.exceptions import InvalidParameterTypeException, ParameterUninitializedException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+
+from pred_core.errors import PredError
+from pred_ros import parameters
+from pred_ros.diagnostics import ERROR, OK, WARN, Diagnostics
+
+BAD_INPUT = 2
+POLL = 0.05  # [s] how soon a signal or the end of the work is noticed
+_LOG_LEVEL = {OK: "info", WARN: "warning"}
+
+
+class NodeConfig(Protocol):
+    """What the shell reads from a node's configuration."""
+
+    @property
+    def autostart(self) -> bool:
+        """Configure and activate without waiting for a lifecycle manager."""
+
+
+class Shell(LifecycleNode):
+    """A lifecycle node with typed configuration. `exit_code` set to a number ends the process."""
+
+    NAME: ClassVar[str]
+    CONFIG: ClassVar[type]
+
+    def __init__(self) -> None:
+        super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True)
+        found = cast(dict[str, Parameter], self.get_parameters_by_prefix(""))
+        given = {k: p.value for k, p in found.items() if not parameters.is_library_name(k)}
+        for name in given:
+            self.undeclare_parameter(name)
+        self.config: Any = parameters.declare(self, self.CONFIG, given)
+        parameters.follow(self, lambda: self.config, self._accept)
+        self.exit_code: int | None = None
+        self.diagnostics = Diagnostics(self.get_fully_qualified_name())
+        self._diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._timer = self.create_timer(1.0, self._heartbeat)
+
+    def setup(self) -> None:
+        """Build the core object and the publishers. May raise PredError."""
+        raise NotImplementedError
+
+    def start(self) -> None:
+        """Subscribe and begin. May raise PredError."""
+        raise NotImplementedError
+
+    def stop(self) -> None:
+        """End what `start` began; join threads. Called once, also after errors."""
+        raise NotImplementedError
+
+    def heartbeat(self) -> None:
+        """Called once a second before diagnostics go out."""
+
+    def changed(self, config: Any) -> None:
+        """A new configuration is about to hold. Raise PredError to refuse it."""
+
+    def report(self, level: bytes, message: str) -> None:
+        """Set the diagnostic status; a change is logged and published at once."""
+        if self.diagnostics.status(level, message):
+            getattr(self.get_logger(), _LOG_LEVEL.get(level, "error"))(message)
+            self.publish_diagnostics()
+
+    def publish_diagnostics(self) -> None:
+        """Publish the diagnostic status now."""
+        self._diagnostics_out.publish(self.diagnostics.message_at(self.get_clock().now().to_msg()))
+
+    def fail(self, error: PredError) -> None:
+        """End the process with one clear line."""
+        self.report(ERROR, str(error))
+        print(f"{self.NAME}: {error}", file=sys.stderr, flush=True)
+        self.exit_code = BAD_INPUT
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Lifecycle: build."""
+        return self._attempt(self.setup)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Lifecycle: run."""
+        return self._attempt(self.start)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Lifecycle: pause."""
+        return self._attempt(self.stop)
+
+    def _attempt(self, action: Any) -> TransitionCallbackReturn:
+        try:
+            action()
+        except PredError as error:
+            self.fail(error)
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def _accept(self, config: Any) -> None:
+        self.changed(config)
+        self.config = config
+
+    def _heartbeat(self) -> None:
+        self.heartbeat()
+        self.publish_diagnostics()
+
+
+def run(node_class: type[Shell], args: list[str] | None = None) -> int:
+    """Run one node until it is done, fails, or receives SIGINT or SIGTERM. Returns the exit code.
+
+    0: done or asked to stop. 2: bad input, one line on stderr.
+    """
+    asked: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda received, _: asked.append(received))
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    node: Shell | None = None
+    try:
+        node = node_class()
+        return _spin(node, asked)
+    except PredError as error:
+        print(f"{node_class.NAME}: {error}", file=sys.stderr, flush=True)
+        return BAD_INPUT
+    except (InvalidParameterTypeException, ParameterUninitializedException) as error:
+        print(f"{node_class.NAME}: {error}", file=sys.stderr, flush=True)
+        return BAD_INPUT
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _spin(node: Shell, asked: list[int]) -> int:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        if node.config.autostart:
+            node.trigger_configure()
+            if node.exit_code is None:
+                node.trigger_activate()
+        while node.exit_code is None and not asked:
+            executor.spin_once(timeout_sec=POLL)
+        return node.exit_code or 0
+    finally:
+        node.stop()
+        executor.shutdown()
