@@ -18,6 +18,7 @@ from pred_core.dynamics import Dynamics, rollout_by_steps
 from pred_core.errors import DivergenceError, InputError
 from pred_core.residual.encoder import shuffled_orders
 from pred_core.residual.network import Buffer, Motion, ResidualNetwork, load_network
+from pred_core.springmass import SpringMass
 from pred_core.twin import Twin
 from pred_core.types import Body, Grip, State
 
@@ -136,6 +137,30 @@ class PReD:
         after[WINDOW] = buffer.window.view(*leading, *buffer.window.shape[1:])
         after[COUNT] = buffer.count.view(leading)
         return torch.where((predicted.held < 0).unsqueeze(-1), residual, 0.0), after
+
+
+def load_base(twin: Twin, device: str = "cpu", *, extensions: bool = True) -> Dynamics:
+    """The twin's spring-mass simulator, with its extensions unless told otherwise, without its residual."""
+    return SpringMass(
+        twin.body,
+        twin.physics,
+        twin.scene,
+        period=twin.meta.period,
+        substeps=twin.meta.substeps,
+        extensions=twin.extensions if extensions else (),
+        device=device,
+    )
+
+
+def load_dynamics(
+    twin: Twin, device: str = "cpu", *, extensions: bool = True, residual: bool = True
+) -> Dynamics:
+    """What the twin predicts with: its simulator, corrected by its residual if it has one.
+
+    `extensions`, `residual`: False leaves them out, to see what they are worth.
+    """
+    base = load_base(twin, device, extensions=extensions)
+    return with_residual(base, twin, device) if residual else base
 
 
 def with_residual(base: Dynamics, twin: Twin, device: str | torch.device = "cpu") -> Dynamics:
