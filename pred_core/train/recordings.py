@@ -102,7 +102,7 @@ def window_index(recordings: Sequence[Recording], steps: int, stride: int) -> Te
     rows = []
     for r, recording in enumerate(recordings):
         whole = torch.isfinite(recording.position).flatten(1).all(dim=1)
-        frames = torch.arange(1, len(recording.position) - steps, stride)
+        frames = torch.arange(1, max(len(recording.position) - steps, 1), stride)
         frames = frames[whole[frames] & whole[frames - 1]]
         rows.append(torch.stack((torch.full_like(frames, r), frames), dim=-1))
     index = torch.cat(rows) if rows else torch.zeros(0, 2, dtype=torch.int64)

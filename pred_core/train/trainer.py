@@ -83,17 +83,18 @@ class Trainer:
         self.optimizer.zero_grad()
         outcome = training_rollout(model, batch, self.config, self.gravity, self.generator)
         outcome.loss.backward()  # type: ignore[no-untyped-call]
+        loss = float(outcome.loss.detach())
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
-        if not (math.isfinite(float(outcome.loss)) and math.isfinite(float(norm))):
+        if not (math.isfinite(loss) and math.isfinite(float(norm))):
             raise DivergenceError(
                 f"training left the finite numbers at step {self.step + 1}",
-                got=f"loss {float(outcome.loss):g}, gradient norm {float(norm):g}",
+                got=f"loss {loss:g}, gradient norm {float(norm):g}",
                 next_step="Lower --learning-rate, --cap or --rollout",
             )
         self.optimizer.step()
         self._update_average()
         self.step += 1
-        self.curves.loss.append(float(outcome.loss))
+        self.curves.loss.append(loss)
         self.curves.error_mm.append(outcome.error)
         self.curves.binding.append(outcome.binding)
         if self.step % self.config.evaluate_every == 0 or self.done:
@@ -134,7 +135,7 @@ class Trainer:
 
     def _draw(self) -> Tensor:
         """(B, 2) the next windows; every window once an epoch, in an order drawn anew for each."""
-        drawn = []
+        drawn: list[int] = []
         while len(drawn) < self.config.batch:
             if self.cursor >= len(self.order):
                 self.order = torch.randperm(len(self.index), generator=self.generator)

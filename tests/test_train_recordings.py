@@ -1,0 +1,86 @@
+"""Episodes to windows: alignment by id, honest hold-out, starts only where everything is measured."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from residual_case import PERIOD, Falling, episodes, line_body
+
+from pred_core.errors import DatasetError
+from pred_core.train import Recording, align
+from pred_core.train.recordings import gather, split_groups, window_index
+from pred_core.types import Episode, Grip
+
+
+def recordings(number: int = 3, frames: int = 12) -> list[Recording]:
+    return [align(e, line_body(), PERIOD) for e in episodes(Falling(), number, frames, seed=0)]
+
+
+def with_tracks(episode: Episode, **changes: object) -> Episode:
+    return dataclasses.replace(episode, tracks=dataclasses.replace(episode.tracks, **changes))
+
+
+def test_columns_follow_the_ids_of_the_body() -> None:
+    (episode,) = episodes(Falling(), 1, 5, seed=0)
+    back = np.arange(6)[::-1]
+    held = np.array([0, -1, -1, -1, -1, -1], np.int32)
+    reversed_ = dataclasses.replace(
+        with_tracks(episode, position=episode.position[:, back], id=episode.tracks.id[back]), held=held[back]
+    )
+    recording = align(reversed_, line_body(), PERIOD)
+    assert np.allclose(recording.position.numpy(), episode.position)
+    assert recording.held[0].tolist() == held.tolist()
+
+
+def test_wrong_rate_and_missing_particles_are_refused() -> None:
+    (episode,) = episodes(Falling(), 1, 5, seed=0)
+    with pytest.raises(DatasetError, match=r"0\.02 s; allowed: 0\.01 s"):
+        align(episode, line_body(), 0.01)
+    with pytest.raises(DatasetError, match="no id 6"):
+        align(episode, line_body(7), PERIOD)
+
+
+def test_a_gripper_that_opened_holds_nothing_more() -> None:
+    (episode,) = episodes(Falling(), 1, 5, seed=0)
+    closed = torch.tensor([[True], [True], [False], [True], [True]])
+    grips = Grip(episode.grips.position, episode.grips.rotation, closed)
+    held = np.array([0, -1, -1, -1, -1, -1], np.int32)
+    recording = align(dataclasses.replace(episode, grips=grips, held=held), line_body(), PERIOD)
+    assert recording.held[:, 0].tolist() == [0, 0, -1, -1, -1]
+
+
+def test_windows_start_where_everything_is_measured() -> None:
+    (episode,) = episodes(Falling(), 1, 10, seed=0)
+    position = episode.position.copy()
+    position[3, 2] = np.nan
+    recording = align(with_tracks(episode, position=position), line_body(), PERIOD)
+    # 4 periods after the start must exist: starts 1..5; 3 and 4 touch the hole.
+    assert window_index([recording], 4, 1)[:, 1].tolist() == [1, 2, 5]
+    batch = gather([recording], torch.tensor([[0, 2]]), 4, PERIOD, torch.device("cpu"))
+    assert batch.seen[0, 0].tolist() == [True, True, False, True, True, True]
+    assert batch.target[0, 0, 2].tolist() == [0.0, 0.0, 0.0]
+    with pytest.raises(DatasetError, match="20 periods"):
+        window_index([recording], 20, 1)
+
+
+def test_batch_reproduces_the_recording() -> None:
+    data = recordings()
+    batch = gather(data, torch.tensor([[0, 1], [2, 4]]), 5, PERIOD, torch.device("cpu"))
+    assert batch.start.position[1].equal(data[2].position[4])
+    assert batch.target[:, 1].equal(data[2].position[5:10])
+    base = Falling()  # made the data, so from the right start it meets every target
+    got = base.rollout(base.start(batch.start, batch.start_grip), batch.grips)
+    assert torch.allclose(got, batch.target, atol=1e-5)
+
+
+def test_groups_are_never_split() -> None:
+    data = [dataclasses.replace(r, group=i // 3) for i, r in enumerate(recordings(9, 4))]
+    fit, held_out = split_groups(data, 0.3, torch.Generator().manual_seed(0))
+    assert len(fit) == 6 and len(held_out) == 3  # one of three groups
+    assert {r.group for r in fit}.isdisjoint(r.group for r in held_out)
+    assert split_groups(data, 0.0, torch.Generator())[1] == []
+    with pytest.raises(DatasetError, match="--holdout 0"):
+        split_groups(data[:3], 0.3, torch.Generator())
