@@ -30,9 +30,13 @@ def setting(
     doc: str = "",
     choices: tuple[str, ...] = (),
     log: bool = False,
+    floor: float | None = None,
 ) -> Any:
-    """A dataclass field with its unit, allowed range and meaning. `log`: searched on a log scale."""
-    metadata = {"unit": unit, "low": low, "high": high, "doc": doc, "choices": choices, "log": log}
+    """A dataclass field with its unit, allowed range and meaning.
+
+    `log`: searched on a log scale, from `floor` up where `low` is zero.
+    """
+    metadata = {"unit": unit, "low": low, "high": high, "doc": doc, "choices": choices, "log": log, "floor": floor}
     if isinstance(default, (list, dict)):
         raise TypeError("use a tuple: configuration is immutable")
     return dataclasses.field(default=default, metadata=metadata)

@@ -93,7 +93,7 @@ class Scene:
 class Physics:
     """The identified scalars of the spring-mass model. Fields carry unit and search range.
 
-    The first five are the paper's (III-A); `bending_stiffness` and `drag` extend them and are off at 0.
+    The first five are the paper's (III-A); `bending_stiffness` extends them and is off at 0.
     """
 
     stiffness: float = setting(100.0, unit="N", low=1e-1, high=1e5, log=True, doc="force per unit strain of a spring")
@@ -101,7 +101,9 @@ class Physics:
     connection_threshold: float = setting(0.03, unit="m", low=1e-3, high=1.0, log=True, doc="longest spring made")
     max_springs: int = setting(20, unit="", low=1, high=64, doc="most springs at a particle")
     ground_friction: float = setting(0.5, unit="", low=0.0, high=3.0, doc="Coulomb coefficient at ground and fixtures")
-    bending_stiffness: float = setting(0.0, unit="N m^2", low=0.0, high=10.0, doc="EI of bending by angle")
+    bending_stiffness: float = setting(
+        0.0, unit="N m^2", low=0.0, high=10.0, log=True, floor=1e-6, doc="EI of bending by angle"
+    )
 
 
 @dataclass(frozen=True)

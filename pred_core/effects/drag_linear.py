@@ -15,7 +15,7 @@ class DragLinear(Effect):
     id = "drag_linear"
     family = "drag"
     hooks = ("force",)
-    parameters = (Parameter("coefficient", "1/s", 0.0, 50.0, doc="rate b at which free motion decays"),)
+    parameters = (Parameter("coefficient", "1/s", 0.0, 50.0, typical=0.5, doc="rate b at which free motion decays"),)
     confounded_with = ("drag_quadratic", "wind")
 
     @classmethod

@@ -15,7 +15,7 @@ class DragQuadratic(Effect):
     id = "drag_quadratic"
     family = "drag"
     hooks = ("force",)
-    parameters = (Parameter("coefficient", "1/m", 0.0, 50.0, doc="b, drag per mass and squared speed"),)
+    parameters = (Parameter("coefficient", "1/m", 0.0, 50.0, typical=0.5, doc="b, drag per mass and squared speed"),)
     confounded_with = ("drag_linear", "wind")
 
     @classmethod

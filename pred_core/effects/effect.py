@@ -29,6 +29,8 @@ class Parameter:
     high: float
     null: float = 0.0
     size: int = 1
+    typical: float = 0.1  # how much of it matters: the first step of a search
+    log: bool = False  # positive, searched on a log scale
     doc: str = ""
 
 

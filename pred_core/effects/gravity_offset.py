@@ -15,7 +15,7 @@ class GravityOffset(Effect):
     id = "gravity_offset"
     family = "gravity"
     hooks = ("force",)
-    parameters = (Parameter("acceleration", "m/s^2", -5.0, 5.0, size=3, doc="dg in world"),)
+    parameters = (Parameter("acceleration", "m/s^2", -5.0, 5.0, size=3, typical=0.2, doc="dg in world"),)
     confounded_with = ("wind", "camera_rotation")
 
     @classmethod

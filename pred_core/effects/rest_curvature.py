@@ -20,8 +20,8 @@ class RestCurvature(Effect):
     family = "bending"
     hooks = ("bend",)
     parameters = (
-        Parameter("first", "1", -1.0, 1.0, size=TERMS, doc="Legendre coefficients of k0 along the first axis"),
-        Parameter("second", "1", -1.0, 1.0, size=TERMS, doc="Legendre coefficients of k0 along the second axis"),
+        Parameter("first", "1", -1.0, 1.0, size=TERMS, typical=0.05, doc="Legendre coefficients of k0 along the first axis"),
+        Parameter("second", "1", -1.0, 1.0, size=TERMS, typical=0.05, doc="Legendre coefficients of k0 along the second axis"),
     )
     confounded_with = ("gravity_offset", "bending_hysteresis")
 
