@@ -29,6 +29,7 @@ class Model:
     digest: str  # changes whenever predictions may change
     build: Build
     twin: Twin | None = None  # shown in the report
+    fold_twins: int | None = None  # number of twins for the folds of a grouped split; None: it refits itself
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,8 @@ def _twin_model(name: str, named: NamedTwin, *, extensions: bool, residual: bool
         return load_dynamics(twin, extensions=extensions, residual=residual)
 
     digests = [t.digest() for t in (named.twin, *named.folds)]
-    return Model(name, f"{' '.join(digests)} extensions={extensions} residual={residual}", build, named.twin)
+    return Model(name, f"{' '.join(digests)} extensions={extensions} residual={residual}", build, named.twin,
+                 len(named.folds))
 
 
 def _baseline(name: str, base: NamedTwin | None) -> Model:
@@ -98,7 +100,8 @@ def _baseline(name: str, base: NamedTwin | None) -> Model:
         if base is None:
             raise ConfigError("last-residual repeats the residual of a twin", next_step="Name one with --twin")
         stage = _twin_model(f"last-residual on {base.name or 'the twin'}", base, extensions=True, residual=False)
-        return Model(name, f"{name} {stage.digest}", lambda *args: LastResidual(stage.build(*args)))
+        digest = f"{name} {stage.digest}"
+        return Model(name, digest, lambda *args: LastResidual(stage.build(*args)), fold_twins=stage.fold_twins)
     return Model(name, name, _BUILD[name])
 
 

@@ -1,0 +1,147 @@
+"""Models x splits x metrics: predictions (cached), scores, and the entries of `metrics.json`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pred_core.bag.dataset import Dataset, EpisodeEntry
+from pred_core.errors import DatasetError, PredError
+from pred_core.evaluate.cache import PredictionCache
+from pred_core.evaluate.models import Model
+from pred_core.evaluate.protocol import check_episodes, predict
+from pred_core.evaluate.scores import METRICS, REPORT_STEP, EpisodeScore, at_step, over_steps, score_episode, statistics
+from pred_core.evaluate.splits import Split, recordings_on_both_sides
+from pred_core.types import Array, Episode
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Result:
+    """One model on one split, episodes in the order of the folds."""
+
+    model: Model
+    split: Split
+    episodes: tuple[Episode, ...]
+    predictions: tuple[Array, ...]  # each (T-2, P, 3) [m], NaN after a divergence
+    scores: tuple[EpisodeScore, ...]
+    tested_on_training_data: int  # episodes the twin was fitted on, by bag hash
+    same_recording: int  # episodes whose recording the model may have seen
+
+    def values(self, metric: str) -> dict[str, float]:
+        """Mean over all steps per episode that did not diverge."""
+        return {s.name: over_steps(s, metric) for s in self.scores if s.diverged is None}
+
+
+@dataclass(frozen=True)
+class NotComputed:
+    """A model that could not be run on a split, and why."""
+
+    model: str
+    split: str
+    reason: str
+
+
+class EpisodeStore:
+    """Episodes of a data set, each read once."""
+
+    def __init__(self, dataset: Dataset):
+        self.dataset = dataset
+        self._read: dict[str, Episode] = {}
+
+    def read(self, entries: Sequence[EpisodeEntry]) -> list[Episode]:
+        """The episodes of `entries`. Raises: BagError."""
+        for entry in entries:
+            if entry.bag not in self._read:
+                self._read[entry.bag] = self.dataset.read(entry)
+        return [self._read[e.bag] for e in entries]
+
+
+def run_model(model: Model, split: Split, store: EpisodeStore, cache: PredictionCache, say: Progress) -> Result:
+    """Predict and score every fold of `split`. Raises: PredError of the model or the data."""
+    episodes: list[Episode] = []
+    predictions: list[Array] = []
+    trained_on, same_recording = 0, 0
+    for index, fold in enumerate(split.folds):
+        number = index if split.grouped else None
+        test = store.read(fold.test)
+        check_episodes(test)
+        key = cache.key(model.digest, fold.digest, number)
+        found = cache.load(key)
+        if found is None:
+            dynamics = model.build(test, store.read(fold.train), number)
+            found = [p.astype(np.float32).astype(np.float64) for p in predict(dynamics, test)]
+            cache.store(key, found)
+            say(f"{model.name} on {split.name}" + (f" fold {index + 1}/{len(split.folds)}" if split.grouped else ""))
+        else:
+            say(f"{model.name} on {split.name}: kept from before")
+        if len(found) != len(test):
+            raise DatasetError(f"{cache.folder}/{key}.npz holds {len(found)} episodes", allowed=len(test),
+                               next_step="Delete the file and run again")
+        if model.twin is not None and not split.grouped:
+            trained_on += len(set(fold.test_hashes) & set(model.twin.meta.data))
+        same_recording += recordings_on_both_sides(fold)
+        episodes += test
+        predictions += found
+    scores = tuple(score_episode(p, e) for p, e in zip(predictions, episodes, strict=True))
+    return Result(model, split, tuple(episodes), tuple(predictions), scores, trained_on, same_recording)
+
+
+def run_all(
+    models: Sequence[Model],
+    optional: frozenset[str],
+    splits: Sequence[Split],
+    store: EpisodeStore,
+    cache: PredictionCache,
+    say: Progress,
+) -> tuple[list[Result], list[NotComputed]]:
+    """Every model on every split. A model named in `optional`, and any twin without twins for the folds of a
+    grouped split, is listed as not computed with its reason; any other failure is raised."""
+    results, missing = [], []
+    for split in splits:
+        for model in models:
+            if split.grouped and model.fold_twins is not None and model.fold_twins != len(split.folds):
+                missing.append(NotComputed(model.name, split.name, _fold_reason(model, split)))
+                continue
+            try:
+                results.append(run_model(model, split, store, cache, say))
+            except PredError as error:
+                if model.name not in optional:
+                    raise
+                missing.append(NotComputed(model.name, split.name, str(error)))
+    return results, missing
+
+
+def entry(result: Result, seed: int) -> dict[str, Any]:
+    """The entry of one model and split in `metrics.json`. The bootstrap is drawn from `seed`, the same for all."""
+    usable = [s for s in result.scores if s.diverged is None]
+    table: dict[str, Any] = {}
+    for name, metric in METRICS.items():
+        table[name] = {
+            "unit": metric.unit,
+            f"step_{REPORT_STEP}": statistics({s.name: at_step(s, name) for s in usable}, np.random.default_rng(seed)),
+            "all_steps": statistics({s.name: over_steps(s, name) for s in usable}, np.random.default_rng(seed)),
+        }
+    return {
+        "model": result.model.name,
+        "split": result.split.name,
+        "grouped_by_recording": result.split.grouped,
+        "folds": len(result.split.folds),
+        "episodes_tested": len(result.scores),
+        "diverged": [{"episode": s.name, "step": s.diverged} for s in result.scores if s.diverged is not None],
+        "hidden_particle_frames": sum(s.hidden for s in result.scores),
+        "tested_on_training_data": result.tested_on_training_data,
+        "episodes_sharing_a_recording_with_training": result.same_recording,
+        "metrics": table,
+    }
+
+
+def _fold_reason(model: Model, split: Split) -> str:
+    return (
+        f"a twin must be fitted anew without each fold's recordings: {model.fold_twins} fold twins given for "
+        f"{len(split.folds)} folds (--fold-twins)"
+    )
