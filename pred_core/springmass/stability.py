@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pred_core.errors import ConfigError
 from pred_core.types import Body, Physics
@@ -17,18 +18,25 @@ SAFETY = 0.5  # of the stability limit: keeps the error of fast modes small too
 MOST_SUBSTEPS = 20_000
 
 
-def spectrum_bound(body: Body, physics: Physics, bend: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
+def spectrum_bound(
+    body: Body,
+    physics: Physics,
+    bend: tuple[float, float] = (0.0, 0.0),
+    held: NDArray[np.bool_] | None = None,
+) -> tuple[float, float]:
     """(w [rad/s], d [1/s]): bounds of the highest frequency and the highest damping rate.
 
-    `bend`: relative bending stiffness and bending damping time [s] that effects add.
+    `bend`: relative bending stiffness and bending damping time [s] that effects add. `held` (N,): particles that
+    never move freely; they have no frequency of their own.
     """
+    free = np.ones(body.count) if held is None else 1.0 - held
     k = physics.stiffness * body.stiffness_scale / np.maximum(body.rest_length, 1e-9)
     c = physics.damping * body.damping_scale
     w2, d = np.zeros(body.count), np.zeros(body.count)
     for end in (0, 1):
         i, j = body.springs[:, end], body.springs[:, 1 - end]
         # Row sum of the mass-scaled matrix: k/m_i + k/sqrt(m_i m_j).
-        weight = 1.0 / body.mass[i] + 1.0 / np.sqrt(body.mass[i] * body.mass[j])
+        weight = free[i] * (1.0 / body.mass[i] + free[j] / np.sqrt(body.mass[i] * body.mass[j]))
         np.add.at(w2, i, k * weight)
         np.add.at(d, i, c * weight)
     if physics.bending_stiffness > 0 and len(body.bends):
@@ -38,7 +46,7 @@ def spectrum_bound(body: Body, physics: Physics, bend: tuple[float, float] = (0.
         lbar = 0.5 * (a + b)
         stiff = physics.bending_stiffness * body.bend_scale / lbar
         # Hessian of a straight bend: EI/lbar g g^T with g = (1/a, -(1/a + 1/b), 1/b) per transverse axis.
-        g = np.stack((1 / a, 1 / a + 1 / b, 1 / b), axis=1)
+        g = np.stack((1 / a, 1 / a + 1 / b, 1 / b), axis=1) * free[body.bends]
         root_mass = np.sqrt(body.mass[body.bends])
         row = (g / root_mass) * (g / root_mass).sum(1, keepdims=True) * stiff[:, None]
         np.add.at(w2, body.bends, row * (1.0 + bend[0]))
@@ -47,15 +55,19 @@ def spectrum_bound(body: Body, physics: Physics, bend: tuple[float, float] = (0.
 
 
 def choose_substeps(
-    body: Body, period: float, physics: list[Physics], bends: list[tuple[float, float]] | None = None
+    body: Body,
+    period: float,
+    physics: list[Physics],
+    bends: list[tuple[float, float]] | None = None,
+    held: NDArray[np.bool_] | None = None,
 ) -> int:
-    """The fewest substeps that keep every world at `SAFETY` of the stability limit.
+    """The fewest substeps that keep every world at `SAFETY` of the stability limit. See `spectrum_bound`.
 
     Raises: ConfigError if more than 20,000 a period would be needed.
     """
     worst = 1
     for n, p in enumerate(physics):
-        w, d = spectrum_bound(body, p, bends[n] if bends else (0.0, 0.0))
+        w, d = spectrum_bound(body, p, bends[n] if bends else (0.0, 0.0), held)
         # Largest h with h^2 w^2/4 + h d/2 = 1.
         limit = period if w == d == 0 else 4.0 / (d + math.sqrt(d * d + 4.0 * w * w))
         worst = max(worst, math.ceil(period / (SAFETY * limit)))
