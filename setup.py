@@ -35,10 +35,10 @@ EXTRAS = {
 }
 
 
-def config_files() -> list[tuple[str, list[str]]]:
-    """Every file under config/, installed with its folder below share/pred_ros/config."""
+def shared_files(top: str) -> list[tuple[str, list[str]]]:
+    """Every file under `top`, installed with its folder below share/pred_ros."""
     folders: dict[str, list[str]] = {}
-    for path in sorted((ROOT / "config").rglob("*")):
+    for path in sorted((ROOT / top).rglob("*")):
         if path.is_file() and "__pycache__" not in path.parts:
             relative = path.relative_to(ROOT)
             folders.setdefault(f"{SHARE}/{relative.parent}", []).append(str(relative))
@@ -68,7 +68,8 @@ setup(
         ("share/ament_index/resource_index/packages", [f"{PACKAGE}/resource/{PACKAGE}"]),
         (SHARE, ["package.xml"]),
         (f"{SHARE}/launch", launch_files()),
-        *config_files(),
+        *shared_files("config"),
+        *shared_files("bags"),
     ],
     install_requires=CORE,
     extras_require=EXTRAS,

@@ -103,7 +103,7 @@ class EvaluatorNode(Shell):
         elif not self._scorer.pairs:
             self.report(WARN, f"no pairs yet ({points} measured, {predictions} predicted frames)")
         elif math.isfinite(mde) and not self._written:
-            self.diagnostics.status(OK, f"mean error {1e3 * mde:.2f} mm over {self._scorer.pairs} frames")
+            self.report(OK, f"mean error {1e3 * mde:.2f} mm over {self._scorer.pairs} frames")
 
     def _check_end(self) -> None:
         if self._ended is None or self._written:

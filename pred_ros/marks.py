@@ -1,7 +1,7 @@
 """Episode marks: std_msgs/String with JSON on `player/episode` (latched), the only thing common_interfaces lacks.
 
     {"event": "begin", "name": "ep003", "index": 0, "count": 14, "begin": 1000000000, "frames": 500,
-     "shift": 0, "split": "test", "recording": 3}
+     "shift": 0, "split": "test", "recording": 3, "kind": "line"}
     {"event": "end", "episodes": 14}
 
 `begin` is the header stamp [ns] of the first tracker/points as published; `shift` [ns] is what was added to the
@@ -31,6 +31,7 @@ class EpisodeMark:
     shift: int = 0  # [ns] added to the capture stamps
     split: str = ""
     recording: int = -1
+    kind: str = ""  # line | sheet | volume | mixed, if known
 
 
 @dataclass(frozen=True)

@@ -182,7 +182,15 @@ class PlayerNode(Shell):
         """Play one episode; returns the earliest stamp for the next [ns]."""
         shift = self._shift(clip, begin_at)
         mark = marks.EpisodeMark(
-            clip.name, index, len(self._clips), clip.begin + shift, clip.frames, shift, clip.split, clip.recording
+            name=clip.name,
+            index=index,
+            count=len(self._clips),
+            begin=clip.begin + shift,
+            frames=clip.frames,
+            shift=shift,
+            split=clip.split,
+            recording=clip.recording,
+            kind=clip.kind,
         )
         self._marks_out.publish(String(data=marks.encode(mark)))
         self.report(OK, f"playing {clip.name} ({index + 1} of {len(self._clips)})")

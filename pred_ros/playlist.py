@@ -30,6 +30,7 @@ class Clip:
     frames: int  # number of tracker/points
     split: str = ""
     recording: int = -1
+    kind: str = ""  # line | sheet | volume | mixed, if known
 
 
 @dataclass(frozen=True, order=True)
@@ -51,7 +52,7 @@ def find_clips(path: Path, split: str = "all", names: tuple[str, ...] = ()) -> l
     if not (path / FILE).is_file():
         if names:
             raise DatasetError(f"{path}: a single bag has no episode names", got=", ".join(names))
-        return [_clip(path, EpisodeEntry(path.name, "test"))]
+        return [_clip(path, EpisodeEntry(path.name, "test"), "")]
     dataset = load_dataset(path)
     entries = dataset.select(None if split == "all" else split)
     known = {Path(e.bag).stem: e for e in entries}
@@ -59,10 +60,10 @@ def find_clips(path: Path, split: str = "all", names: tuple[str, ...] = ()) -> l
         if name not in known:
             raise DatasetError(f"{path}: no episode '{name}' in split {split}", next_step=nearest(name, known))
     chosen = [known[n] for n in names] if names else list(entries)
-    return [_clip(dataset.root / e.bag, e) for e in chosen]
+    return [_clip(dataset.root / e.bag, e, dataset.object.kind) for e in chosen]
 
 
-def _clip(path: Path, entry: EpisodeEntry) -> Clip:
+def _clip(path: Path, entry: EpisodeEntry, kind: str) -> Clip:
     reader = open_bag(path)
     if reader.damage is not None:
         raise BagError(f"{path.name}: truncated or damaged bag, {reader.damage}", next_step="Record the episode again")
@@ -70,7 +71,7 @@ def _clip(path: Path, entry: EpisodeEntry) -> Clip:
     first = next(iter(reader.read_messages((TRACKER_POINTS,))))
     begin = read_tracker_points(first.decode(), first.where).stamp
     frames = reader.topics[TRACKER_POINTS].count
-    return Clip(reader.path, Path(entry.bag).stem, begin, frames, entry.split, entry.recording)
+    return Clip(reader.path, Path(entry.bag).stem, begin, frames, entry.split, entry.recording, kind)
 
 
 def stream(clip: Clip) -> Iterator[Timed]:

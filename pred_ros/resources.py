@@ -13,17 +13,24 @@ _CHECKOUT = Path(__file__).resolve().parents[1]
 
 def config_folder() -> Path:
     """The folder `config`. Raises: ConfigError if the installation is incomplete."""
-    places = [_CHECKOUT / "config"]
-    places += [
-        Path(p) / "share" / "pred_ros" / "config" for p in (os.environ.get("AMENT_PREFIX_PATH") or "").split(":") if p
-    ]
-    places.append(Path(sys.prefix) / "share" / "pred_ros" / "config")
-    for place in places:
-        if (place / "fastdds.xml").is_file():
-            return place
-    raise ConfigError("config/ of this installation is missing", got="nothing in " + ", ".join(map(str, places)))
+    return _find("config", "fastdds.xml")
+
+
+def sample_dataset() -> Path:
+    """The bundled synthetic cable. Raises: ConfigError if the installation is incomplete."""
+    return _find("bags/sample_cable", "dataset.yaml")
 
 
 def fastdds_profile() -> Path:
     """The Fast DDS profile with a large shared-memory segment."""
     return config_folder() / "fastdds.xml"
+
+
+def _find(folder: str, witness: str) -> Path:
+    prefixes = [Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if p]
+    shares = [p / "share" / "pred_ros" for p in (*prefixes, Path(sys.prefix))]
+    places = [root / folder for root in (_CHECKOUT, *shares)]
+    for place in places:
+        if (place / witness).is_file():
+            return place
+    raise ConfigError(f"{folder}/ of this installation is missing", got="nothing in " + ", ".join(map(str, places)))

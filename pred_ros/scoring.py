@@ -64,6 +64,7 @@ class Scored:
     measured: Array  # (T, P, 3) [m] world; NaN where hidden
     predicted: Array  # (T, P, 3) [m] world; NaN where none came
     announced: int  # frames the player promised
+    line: bool  # consecutive particles are neighbours
 
     @property
     def scorable(self) -> NDArray[np.bool_]:
@@ -142,7 +143,9 @@ class Scorer:
             if found is not None:
                 predicted[t] = _in_order(found, ids)
         stamps = np.array([f.stamp for f in frames], np.int64)
-        return Scored(mark.name, mark.split, mark.recording, stamps, ids, measured, predicted, mark.frames)
+        return Scored(
+            mark.name, mark.split, mark.recording, stamps, ids, measured, predicted, mark.frames, mark.kind == "line"
+        )
 
     def _pair(self, prediction: tuple[NDArray[np.uint32], Array], frame: PointFrame) -> None:
         predicted = _in_order(prediction, frame.id)[None]

@@ -23,7 +23,6 @@ from pred_ros.diagnostics import ERROR, OK, WARN, Diagnostics
 
 BAD_INPUT = 2
 POLL = 0.05  # [s] how soon a signal or the end of the work is noticed
-_LOG_LEVEL = {OK: "info", WARN: "warning"}
 
 
 class NodeConfig(Protocol):
@@ -74,8 +73,17 @@ class Shell(LifecycleNode):
     def report(self, level: bytes, message: str) -> None:
         """Set the diagnostic status; a change is logged and published at once."""
         if self.diagnostics.status(level, message):
-            getattr(self.get_logger(), _LOG_LEVEL.get(level, "error"))(message)
+            self._log(level, message)
             self.publish_diagnostics()
+
+    def _log(self, level: bytes, message: str) -> None:
+        # The client library wants each severity at a place of its own.
+        if level == OK:
+            self.get_logger().info(message)
+        elif level == WARN:
+            self.get_logger().warning(message)
+        else:
+            self.get_logger().error(message)
 
     def publish_diagnostics(self) -> None:
         """Publish the diagnostic status now."""
