@@ -88,7 +88,7 @@ def test_batch_equals_loop(count: int) -> None:
 
 
 def test_patch_borrowing_covers_every_point_once() -> None:
-    # 130 points in patches of at most 64: three of 44, the last borrows two points from the second.
+    # 130 points in patches of at most 64: three of 48 (44 in whole lanes of 8), the last borrows 14 points.
     encoder = Encoder(dataclasses.replace(SMALL, patch=64, encoder_layers=1))
     position = torch.rand(1, 130, 3, generator=torch.Generator().manual_seed(0))
     channels = torch.randn(1, 130, 18, generator=torch.Generator().manual_seed(1)).requires_grad_()
@@ -96,7 +96,7 @@ def test_patch_borrowing_covers_every_point_once() -> None:
     for i in (0, 60, 129):
         (gradient,) = torch.autograd.grad(features[0, i, 0], channels, retain_graph=True)
         reached = gradient[0].abs().sum(-1) > 0
-        assert reached[i] and 44 <= int(reached.sum()) <= 50  # its patch and 3 serial neighbours on each side
+        assert reached[i] and 48 <= int(reached.sum()) <= 54  # its patch and 3 serial neighbours on each side
 
 
 def test_translation_changes_nothing_with_centered_coordinates() -> None:

@@ -20,7 +20,7 @@ class ResidualConfig:
     feature: int = setting(64, low=8, high=1024, doc="width of the encoder (Table III)")
     encoder_layers: int = setting(4, low=1, high=32, doc="blocks of serialised attention (not in the paper)")
     encoder_feedforward: int = setting(128, low=8, high=4096, doc="width inside a block's MLP (not in the paper)")
-    patch: int = setting(64, low=4, high=4096, doc="points that attend to each other (not in the paper)")
+    patch: int = setting(48, low=4, high=4096, doc="points that attend to each other (not in the paper)")
     reach: int = setting(3, low=1, high=32, doc="serial neighbours on each side in the positional encoding")
     decoder: bool = setting(True, doc="NeRF-style decoder; off: features project straight to velocity (Appendix F)")
     hidden_layers: int = setting(2, low=1, high=16, doc="of the decoder (Table III)")

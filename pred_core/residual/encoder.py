@@ -24,6 +24,7 @@ def _patches(count: int, patch: int, device: torch.device) -> tuple[int, Tensor,
     """Patch size S, slots (P*S,) -> rank, rank (N,) -> slot. The last patch borrows from the one before it."""
     patches = -(-count // patch)
     size = -(-count // patches)
+    size = size if patches == 1 else min(-(-size // 8) * 8, count)  # whole SIMD lanes
     take = torch.arange(patches * size)
     take[(patches - 1) * size :] = torch.arange(count - size, count)
     back = torch.arange(count)
@@ -56,15 +57,19 @@ def relative_basis(position: Tensor, reach: int) -> Tensor:
     """(B, N, 2 reach + 1, 4): Gaussian weight w of each serial neighbour, and w r; position (B, N, 3) serial [m].
 
     r is the offset over the cloud's mean serial spacing, so that the encoding knows no unit of length.
+    Slots before the first and after the last point weigh nothing.
     """
-    width = 2 * reach + 1
+    count, width = position.shape[1], 2 * reach + 1
     spacing = (position[:, 1:] - position[:, :-1]).norm(dim=-1).mean(dim=-1).clamp_min(1e-9)
-    padded = functional.pad(position, (0, 0, reach, reach), value=float("inf"))
-    near = padded.unfold(1, width, 1).transpose(-1, -2)
-    inside = torch.isfinite(near)
-    offset = torch.where(inside, near - position.unsqueeze(-2), 0.0) / spacing[:, None, None, None]
-    weight = torch.exp(-0.125 * offset.square().sum(dim=-1, keepdim=True)) * inside[..., :1]
-    return torch.cat((weight, weight * offset), dim=-1) / width
+    scaled = position.transpose(1, 2) / spacing[:, None, None]  # (B, 3, N): points last, so passes are contiguous
+    padded = functional.pad(scaled, (reach, reach))
+    offset = torch.stack([padded[..., i : i + count] for i in range(width)], dim=2) - scaled.unsqueeze(2)
+    neighbour = torch.arange(width, device=position.device)[:, None] + torch.arange(
+        -reach, count - reach, device=position.device
+    )
+    inside = (neighbour >= 0) & (neighbour < count)
+    weight = torch.exp(-0.125 * offset.square().sum(dim=1)) * (inside / width)  # (B, 2 reach + 1, N)
+    return torch.cat((weight.unsqueeze(1), weight.unsqueeze(1) * offset), dim=1).permute(0, 3, 2, 1).contiguous()
 
 
 class Block(nn.Module):
@@ -86,7 +91,7 @@ class Block(nn.Module):
         """(B, N, C) -> (B, N, C), both in serial order."""
         x = x + self.position(x, basis)
         x = x + self.out(self._attend(self.qkv(self.attention_norm(x))))
-        return x + self.mlp_out(functional.gelu(self.mlp_in(self.mlp_norm(x)), approximate="tanh"))
+        return x + self.mlp_out(functional.gelu(self.mlp_in(self.mlp_norm(x))))
 
     def _attend(self, qkv: Tensor) -> Tensor:
         batch, count, width = qkv.shape[0], qkv.shape[1], qkv.shape[2] // 3
@@ -115,17 +120,18 @@ class Encoder(nn.Module):
         Block i uses order `shuffle[i mod 4]` (an index into ORDERS); None: 0, 1, 2, 3 as at inference.
         """
         batch, count = channels.shape[:2]
-        orders = serial_orders(position.detach())
+        used = [i % len(ORDERS) if shuffle is None else shuffle[i % len(ORDERS)] for i in range(len(self.blocks))]
         base = torch.arange(0, batch * count, count, device=channels.device)[:, None]
+        flat = serial_orders(position.detach()) + base  # (4, B, N) indices into points of all clouds
+        kept = sorted(set(used))
+        serial = position.flatten(0, 1)[flat[kept]].flatten(0, 1)
+        bases = dict(zip(kept, relative_basis(serial, self.reach).chunk(len(kept)), strict=True))
+        slots = torch.arange(batch * count, device=channels.device)
         x = self.embed(channels).flatten(0, 1)
-        flat_position = position.flatten(0, 1)
-        slots = base + torch.arange(count, device=channels.device)
         rank = slots  # where each point stands in x
-        for i, block in enumerate(self.blocks):
-            order = orders[i % len(ORDERS) if shuffle is None else shuffle[i % len(ORDERS)]]
-            flat = (order + base).flatten()
-            serial = flat_position[flat].view(batch, count, 3)
+        for block, order in zip(self.blocks, used, strict=True):
+            along = flat[order].flatten()
             # One gather takes x from the order of the block before to the order of this block.
-            x = block(x[rank.flatten()[flat]].view(batch, count, -1), relative_basis(serial, self.reach)).flatten(0, 1)
-            rank = torch.empty_like(slots).scatter_(1, order, slots)
-        return self.norm(x[rank.flatten()]).view(batch, count, -1)
+            x = block(x[rank[along]].view(batch, count, -1), bases[order]).flatten(0, 1)
+            rank = torch.empty_like(slots).scatter_(0, along, slots)
+        return self.norm(x[rank]).view(batch, count, -1)

@@ -58,17 +58,20 @@ class TemporalLayer(nn.Module):
         bias = self.qkv.bias.view(3, 1, heads, head)
         lifted = torch.cat((lifted[..., :3], (lifted[..., 3] + bias).unsqueeze(-1)), dim=-1)
         query, key, value = lifted.unbind(0)  # (W, H, C, 4)
-        form = torch.einsum("ihca,jhcb->iajhb", query, key) / math.sqrt(head)
-        x1 = functional.pad(window, (0, 1), value=1.0)  # (W, M, 4)
-        left = torch.bmm(x1, form.reshape(length, 4, -1)).view(length, count, length, heads, 4)
-        score = (left * x1.transpose(0, 1)[:, :, None, :]).sum(dim=-1)  # (W, M, W, H)
-        share = torch.softmax(score, dim=2)
-        motion = torch.einsum("imjh,jmb->imhb", share, window)
+        form = torch.einsum("ihca,jhcb->ijhab", query, key) / math.sqrt(head)
+        # Particles last from here on: every elementwise pass runs over contiguous particles.
+        moves = window.transpose(1, 2)  # (W, 3, M)
+        x1 = functional.pad(moves, (0, 0, 0, 1), value=1.0).contiguous()  # (W, 4, M)
+        pairs = (x1[:, None, :, None] * x1[None, :, None, :]).view(length, length, 16, count)  # x_i x_j^T
+        score = torch.matmul(form.flatten(3), pairs)  # (W query, W key, H, M)
+        share = torch.softmax(score, dim=1)
+        motion = (share.unsqueeze(3) * moves[None, :, None]).sum(dim=1)  # (W, H, 3, M)
         out = self.out.weight.view(-1, heads, head)
         moving = torch.einsum("dhc,hcb->hbd", out, value[0, :, :, :3])  # the same for every slot
-        resting = torch.einsum("dhc,jhc->hjd", out, value[..., 3])
-        mixed = torch.cat((motion, share.transpose(2, 3)), dim=-1).flatten(2)  # (W, M, H (3 + W))
-        return mixed @ torch.cat((moving, resting), dim=1).flatten(0, 1) + self.out.bias
+        resting = torch.einsum("dhc,jhc->jhd", out, value[..., 3])
+        mixed = torch.cat((motion.flatten(1, 2), share.flatten(1, 2)), dim=1)  # (W, H (3 + W), M)
+        mixing = torch.cat((moving.flatten(0, 1), resting.flatten(0, 1)))
+        return mixed.transpose(1, 2) @ mixing + self.out.bias
 
     def attend_all(self, tokens: Tensor) -> Tensor:
         """Attention output (W, M, d) of every token; tokens (W, M, d)."""
