@@ -114,8 +114,8 @@ def main() -> None:
     counted = {k: v * args.batch for k, v in operations(config, args.particles).items()}
     counted["step"] = sum(counted.values())
     parameters = sum(p.numel() for p in network.parameters())
-    print(f"{args.batch} x {args.particles} particles, {args.device}, {args.threads} thread(s), {parameters} parameters")
-    print(f"fp32, {args.rounds} alternating rounds; matrix product of {side}: {rate / 1e9:.1f} GFLOP/s")
+    print(f"{args.batch} x {args.particles} particles, {args.device}, {args.threads} thread(s)")
+    print(f"{parameters} parameters, fp32, {args.rounds} alternating rounds; matrix product of {side}: {rate / 1e9:.1f} GFLOP/s")
     print(f"{'part':28}{'min [ms]':>10}{'median':>10}{'MFLOP':>10}{'floor [ms]':>12}{'min/floor':>11}")
     for name in list(parts)[:-1]:
         low, middle = 1e3 * min(times[name]), 1e3 * statistics.median(times[name])
