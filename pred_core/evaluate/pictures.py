@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pred_core.evaluate.evaluation import Result
@@ -51,11 +52,13 @@ def error_by_episode(results: Sequence[Result], main: Result) -> Figure:
     look = styles([r.model.name for r in results])
     highest = 0.0
     for result in results:
+        if result.model.name == "constant-velocity":  # far off the scale of every other model
+            continue
         values = result.values("coordinate_l1")
         x = [i for i, name in enumerate(order) if name in values]
         y = np.array([values[order[i]] * CM for i in x])
         name = result.model.name
-        if len(y) and name != "constant-velocity":
+        if len(y):
             highest = max(highest, float(y.max()))
         strong = result is main
         size, alpha, order_z = (34, 1.0, 3) if strong else (15, 0.65, 2)
@@ -94,7 +97,7 @@ def error_on_object(results: Sequence[Result]) -> Figure:
         row[0].set_ylim(bottom=0)
         row[0].set_title(result.model.name, loc="left", fontsize=11, fontweight="bold", color=INK)
         tidy(row[0], "particle id", "mean |error| [cm]")
-        tidy(row[1], "particle id", "mean error, predicted - measured [cm]")
+        tidy(row[1], "particle id", "mean signed error [cm]")
         tidy(row[2], "frequency [Hz]", "share of squared error below [%]")
     grid[0, 0].legend(frameon=False, fontsize=8)
     return figure
@@ -112,19 +115,31 @@ def shapes(result: Result, episode_name: str, others: Sequence[Result] = ()) -> 
     grid = figure.subplots(2, 5, sharex="row", sharey="row")
     joined = "o-" if episode.object.kind == "line" else "."
     for row, (axis, label) in zip(grid, zip(horizontal, ("side", "front"), strict=True), strict=True):
+        spans: list[Array] = []
         for axes, t in zip(row, times, strict=True):
             layers = [("measured", measured[t], INK, 2.6)]
             for one in (*others, result):
                 position = one.predictions[[e.name for e in one.episodes].index(episode_name)][t]
                 layers.append((one.model.name, position, look[one.model.name][0], 1.4))
+            spans += [np.column_stack((position @ axis, position[:, 2])) for _, position, _, _ in layers]
             for name, position, color, width in layers:
                 axes.plot(position @ axis, position[:, 2], joined, color=color, linewidth=width, markersize=2.5,
                           alpha=0.55 if name == "measured" else 1.0, label=name)
-            axes.set_aspect("equal", adjustable="datalim")
+            axes.set_aspect("equal", adjustable="box")
             axes.set_title(f"{(t + 1) * episode.period:.2f} s", fontsize=9, color=GREY)
             tidy(axes, f"{label} view [m]", "z [m]" if axes is row[0] else "")
-    grid[0, 0].legend(frameon=False, fontsize=7, loc="best")
+        _square_limits(row[0], np.concatenate(spans))
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=9)
     return figure
+
+
+def _square_limits(axes: Axes, points: Array) -> None:
+    """Equal scale on both axes, everything inside. Points (M, 2), NaN = not drawn."""
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    center, half = (low + high) / 2, 0.55 * float((high - low).max())
+    axes.set_xlim(center[0] - half, center[0] + half)
+    axes.set_ylim(center[1] - half, center[1] + half)
 
 
 def usable(result: Result) -> tuple[list[Array], list]:  # type: ignore[type-arg]

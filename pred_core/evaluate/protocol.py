@@ -93,29 +93,36 @@ def _predict_batch(dynamics: Dynamics, episodes: Sequence[Episode]) -> list[Arra
         try:
             positions = dynamics.rollout(state, grips.span(begin, frames))
         except DivergenceError:
-            positions = _step_until_divergence(dynamics, state, grips.span(begin, frames))
+            positions = _one_by_one(dynamics, state, grips.span(begin, frames))
     if first is not None:
         positions = torch.cat((first, positions))
     whole = positions.double().numpy(force=True)
     return [_cut(whole[:, i]) for i in range(len(episodes))]
 
 
-def _step_until_divergence(dynamics: Dynamics, state: State, grips: Grip) -> Tensor:
-    """Positions (T, B, N, 3), each world stepped on its own; NaN from the step at which a world diverges."""
-    steps, batch = grips.position.shape[0], state.position.shape[0]
-    positions = torch.full((steps, *state.position.shape), torch.nan)
-    for world in range(batch):
-        one = State(state.position[world], state.velocity[world], state.held[world],
-                    {k: v[world] for k, v in state.memory.items()})
-        for t in range(steps):
-            grip = grips.at(t)
-            try:
-                one = dynamics.step(one, Grip(grip.position[world], grip.rotation[world], grip.closed[world]))
-            except DivergenceError:
-                break
-            if not bool(torch.isfinite(one.position).all()):
-                break
-            positions[t, world] = one.position
+def _one_by_one(dynamics: Dynamics, state: State, grips: Grip) -> Tensor:
+    """Positions (T, B, N, 3), each world on its own; NaN from the step at which a world diverges."""
+    worlds = []
+    for w in range(state.position.shape[0]):
+        memory = {key: value[w] for key, value in state.memory.items()}
+        one = State(state.position[w], state.velocity[w], state.held[w], memory)
+        grip = Grip(grips.position[:, w], grips.rotation[:, w], grips.closed[:, w])
+        try:
+            worlds.append(dynamics.rollout(one, grip))
+        except DivergenceError:
+            worlds.append(_until_divergence(dynamics, one, grip))
+    return torch.stack(worlds, dim=1)
+
+
+def _until_divergence(dynamics: Dynamics, state: State, grips: Grip) -> Tensor:
+    """Positions (T, N, 3) of one world, NaN from the step at which `step` refuses to go on."""
+    positions = torch.full((grips.position.shape[0], *state.position.shape), torch.nan)
+    for t in range(len(positions)):
+        try:
+            state = dynamics.step(state, grips.at(t))
+        except DivergenceError:
+            break
+        positions[t] = state.position
     return positions
 
 
