@@ -34,7 +34,8 @@ def read_gripper_pose(message: Any, where: str) -> PoseFrame:
     ).reshape(-1, 4)
     if not np.isfinite(position).all() or not np.isfinite(rotation).all():
         raise BagError(f"{where}: a gripper pose is not finite", next_step="Record only poses the arm reported")
-    norm = np.linalg.norm(rotation, axis=-1)
+    with np.errstate(over="ignore"):  # a damaged quaternion may be huge; infinity is not 1 either
+        norm = np.linalg.norm(rotation, axis=-1)
     if (np.abs(norm - 1.0) > UNIT_TOLERANCE).any():
         raise BagError(f"{where}: a gripper quaternion has no unit norm", got=norm.tolist(), allowed="1 +- 0.001")
     check_extent(position, where)

@@ -21,6 +21,7 @@ from pred_core.errors import BagError
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS, DATA_END = 1, 2, 3, 4, 5, 6, 0x0B, 0x0F
+LATEST_TIME = 1 << 62  # [ns] since 1970; differences of times below it fit 64 bits
 LARGEST_RECORD = 1 << 30  # [bytes]; a longer one is a damaged length, or does not fit in memory
 
 
@@ -145,6 +146,8 @@ def parse_message(content: bytes) -> Message:
     """A message record."""
     fields = Fields(content)
     channel, _, log_time, publish_time = fields.unpack("HIQQ")
+    if log_time > LATEST_TIME:
+        raise Damage(f"a message was recorded at {log_time} ns, after the year 2116")
     return Message(channel, log_time, publish_time, fields.take(fields.left))
 
 

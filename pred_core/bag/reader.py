@@ -68,6 +68,8 @@ class BagReader:
     def require(self, topics: Iterable[str] = REQUIRED) -> None:
         """Raise BagError unless every topic is there, with its type and at least one message."""
         for topic in topics:
+            if topic not in self.topics and self.damage:
+                raise self._damaged(self.damage)
             if topic not in self.topics:
                 held = ", ".join(sorted(self.topics)) or "no topics"
                 raise BagError(
@@ -97,9 +99,9 @@ class BagReader:
         except mcap.Damage as damage:
             self.damage = str(damage)
             if not partial:
-                raise self._damaged(damage) from damage
+                raise self._damaged(str(damage)) from damage
 
-    def _damaged(self, damage: BagError) -> BagError:
+    def _damaged(self, damage: str) -> BagError:
         return BagError(
             f"{self.path.name}: truncated or damaged bag, {damage}",
             next_step=f"'pred info {self.path.name}' shows what can still be read; record the episode again",

@@ -7,6 +7,7 @@ from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +69,7 @@ class DatasetSummary:
     kind: str
     rate: float  # [Hz]
     sigma: float | None  # [m]
-    known: dict[str, object]
+    known: dict[str, Any]
     splits: dict[str, int]  # episodes a split
     recordings: int
     shared_recordings: list[int]  # recordings with episodes in train and in test: the split leaks
