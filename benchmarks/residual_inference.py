@@ -115,7 +115,8 @@ def main() -> None:
     counted["step"] = sum(counted.values())
     parameters = sum(p.numel() for p in network.parameters())
     print(f"{args.batch} x {args.particles} particles, {args.device}, {args.threads} thread(s)")
-    print(f"{parameters} parameters, fp32, {args.rounds} alternating rounds; matrix product of {side}: {rate / 1e9:.1f} GFLOP/s")
+    print(f"{parameters} parameters, fp32, {args.rounds} alternating rounds")
+    print(f"matrix product of {side}: {rate / 1e9:.1f} GFLOP/s")
     print(f"{'part':28}{'min [ms]':>10}{'median':>10}{'MFLOP':>10}{'floor [ms]':>12}{'min/floor':>11}")
     for name in list(parts)[:-1]:
         low, middle = 1e3 * min(times[name]), 1e3 * statistics.median(times[name])
