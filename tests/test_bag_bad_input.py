@@ -219,6 +219,18 @@ def test_a_long_gap_of_the_tracker(tmp_path: Path) -> None:
         read_episode(path)
 
 
+def test_a_gap_of_more_periods_than_there_are_frames(tmp_path: Path) -> None:
+    """Stamps 1 ns apart and a pause of 0.5 s would be 500 million lost frames."""
+
+    def edit(topic, message, number):
+        if topic == TRACKER_POINTS:
+            message.header.stamp.nanosec = number if number < 15 else 500_000_000 + number
+        return message
+
+    with pytest.raises(BagError, match="gap of 0.5 s at 5.000 s; allowed: 1 s, and no more frames lost than measured"):
+        read_episode(edited_bag(tmp_path / "a.mcap", edit))
+
+
 def test_another_rate_than_the_data_set_says(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="got 100 Hz; allowed: 30 Hz"):
         read_episode(line_bag(tmp_path / "a.mcap"), rate=30.0)

@@ -108,6 +108,8 @@ def test_rosbags_reads_what_we_write(tmp_path: Path) -> None:
         assert reader.message_count == 60
         assert {c.topic: c.msgtype for c in reader.connections}[TRACKER_POINTS] == "sensor_msgs/msg/PointCloud2"
         connection = next(c for c in reader.connections if c.topic == GRIPPER_POSE)
+        (qos,) = connection.ext.offered_qos_profiles
+        assert qos.reliability.name == "RELIABLE" and qos.depth == 5
         _, _, data = next(iter(reader.messages([connection])))
         assert reader.deserialize(data, connection.msgtype).poses[0].position.z == 0.5
 

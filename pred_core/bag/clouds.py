@@ -5,6 +5,7 @@ Reads message objects of any origin (a bag, a live subscription): only their fie
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -50,54 +51,63 @@ class PointFrame:
 
 def cloud_array(message: Any, required: Layout, where: str) -> NDArray[Any]:
     """Structured array (P,) of a PointCloud2, fields by name. Raises: BagError on another layout."""
-    fields = {f.name: f for f in message.fields}
-    described = ", ".join(f"{f.name} {_DTYPES.get(int(f.datatype), f'datatype {f.datatype}')}" for f in message.fields)
-    wanted = ", ".join(f"{name} {kind}" for name, kind in required.items())
-
-    def refuse(problem: str) -> BagError:
-        return BagError(f"{where}: unknown field layout, {problem}", got=described or "no fields", allowed=wanted)
-
-    if len(fields) != len(message.fields):
-        raise refuse("a field is named twice")
+    fields = tuple((f.name, int(f.offset), int(f.datatype), int(f.count)) for f in message.fields)
     step = int(message.point_step)
-    end = 0
-    for name, field in sorted(fields.items(), key=lambda item: int(item[1].offset)):
-        kind = _DTYPES.get(int(field.datatype))
-        if kind is None or int(field.count) < 1:
-            raise refuse(f"field '{name}' has datatype {field.datatype} and count {field.count}")
-        if int(field.offset) < end:
-            raise refuse(f"field '{name}' overlaps the one before it")
-        end = int(field.offset) + np.dtype(kind).itemsize * int(field.count)
-        if end > step:
-            raise refuse(f"field '{name}' ends beyond point_step {step}")
-    for name, kind in required.items():
-        if name not in fields:
-            raise refuse(f"no field '{name}'")
-        if _DTYPES[int(fields[name].datatype)] != kind or int(fields[name].count) != 1:
-            raise refuse(f"field '{name}' is not one {kind}")
-    for name, allowed in _OPTIONAL.items():
-        if name in fields and (_DTYPES[int(fields[name].datatype)] not in allowed or int(fields[name].count) != 1):
-            raise refuse(f"field '{name}' is not one {' or '.join(allowed)}")
-
+    found = _layout(fields, step, bool(message.is_bigendian), tuple(required.items()))
+    problem = found if isinstance(found, str) else ""
     width, height, row = int(message.width), int(message.height), int(message.row_step)
     data = np.frombuffer(message.data, np.uint8)
-    if width * height == 0:
-        rows = np.zeros((0, step), np.uint8)
-    elif row < width * step or data.size != row * height:
-        raise refuse(f"{height} x {width} points of {step} bytes, row_step {row}, do not fit {data.size} bytes")
-    else:
-        rows = np.ascontiguousarray(data.reshape(height, row)[:, : width * step]).reshape(-1, step)
-    order = ">" if message.is_bigendian else "<"
-    used = [n for n in fields if int(fields[n].count) == 1]
-    dtype = np.dtype(
+    if not problem and width * height and (row < width * step or data.size != row * height):
+        problem = f"{height} x {width} points of {step} bytes, row_step {row}, do not fit {data.size} bytes"
+    if problem:
+        described = [f"{name} {_DTYPES.get(kind, f'datatype {kind}')}" for name, _, kind, _ in fields]
+        raise BagError(
+            f"{where}: unknown field layout, {problem}",
+            got=", ".join(described) or "no fields",
+            allowed=", ".join(f"{name} {kind}" for name, kind in required.items()),
+        )
+    if not width * height:
+        return np.zeros(0, found)
+    rows = np.ascontiguousarray(data.reshape(height, row)[:, : width * step])
+    return rows.reshape(-1).view(found)
+
+
+@functools.lru_cache(maxsize=64)
+def _layout(
+    fields: tuple[tuple[str, int, int, int], ...], step: int, big_endian: bool, required: tuple[tuple[str, str], ...]
+) -> np.dtype[Any] | str:
+    """The numpy type of a point from (name, offset, datatype, count) of its fields, or what is wrong with them."""
+    kinds = {name: (_DTYPES.get(datatype), count) for name, _, datatype, count in fields}
+    if len(kinds) != len(fields):
+        return "a field is named twice"
+    end = 0
+    for name, offset, datatype, count in sorted(fields, key=lambda f: f[1]):
+        kind = _DTYPES.get(datatype)
+        if kind is None or count < 1:
+            return f"field '{name}' has datatype {datatype} and count {count}"
+        if offset < end:
+            return f"field '{name}' overlaps the one before it"
+        end = offset + np.dtype(kind).itemsize * count
+        if end > step:
+            return f"field '{name}' ends beyond point_step {step}"
+    for name, wanted in required:
+        if name not in kinds:
+            return f"no field '{name}'"
+        if kinds[name] != (wanted, 1):
+            return f"field '{name}' is not one {wanted}"
+    for name, allowed in _OPTIONAL.items():
+        if name in kinds and kinds[name] not in [(kind, 1) for kind in allowed]:
+            return f"field '{name}' is not one {' or '.join(allowed)}"
+    used = [f for f in fields if f[3] == 1]
+    order = ">" if big_endian else "<"
+    return np.dtype(
         {
-            "names": used,
-            "formats": [order + _DTYPES[int(fields[n].datatype)] for n in used],
-            "offsets": [int(fields[n].offset) for n in used],
+            "names": [name for name, _, _, _ in used],
+            "formats": [order + _DTYPES[datatype] for _, _, datatype, _ in used],
+            "offsets": [offset for _, offset, _, _ in used],
             "itemsize": step,
         }
     )
-    return rows.view(dtype).reshape(-1)
 
 
 def read_tracker_points(message: Any, where: str) -> PointFrame:
@@ -115,10 +125,12 @@ def read_tracker_points(message: Any, where: str) -> PointFrame:
     bad = ~((confidence >= 0) & (confidence <= 1))
     if bad.any():
         raise BagError(f"{where}: confidence of ids {_some(ids[bad])}", got=_some(confidence[bad]), allowed="0 to 1")
-    unique, counts = np.unique(ids, return_counts=True)
-    if (counts > 1).any():
-        raise BagError(f"{where}: duplicate ids {_some(unique[counts > 1])}", allowed="each particle once a message")
-    position = np.stack([cloud[axis] for axis in "xyz"], axis=-1).astype(np.float64)
+    ordered = np.sort(ids)
+    repeated = ordered[1:][ordered[1:] == ordered[:-1]]
+    if len(repeated):
+        raise BagError(f"{where}: duplicate ids {_some(np.unique(repeated))}", allowed="each particle once a message")
+    with np.errstate(invalid="ignore"):  # a signalling NaN warns when cast; NaN is looked for below
+        position = np.stack([cloud[axis] for axis in "xyz"], axis=-1).astype(np.float64)
     visible = confidence > 0
     bad = visible & ~np.isfinite(position).all(-1)
     if bad.any():

@@ -149,10 +149,10 @@ def _regular(
     for frame in points[1:]:
         gap = frame.stamp - stamps[-1]
         lost = round(gap / period) - 1
-        if lost > 0 and gap * 1e-9 > max(LONGEST_GAP, 3e-9 * period):
+        if lost > len(points) or (lost > 0 and gap * 1e-9 > max(LONGEST_GAP, 3e-9 * period)):
             raise BagError(
                 f"{bag}: {TRACKER_POINTS} has a gap of {gap * 1e-9:.3g} s at {stamps[-1] * 1e-9:.3f} s",
-                allowed=f"{LONGEST_GAP:g} s",
+                allowed=f"{LONGEST_GAP:g} s, and no more frames lost than measured",
                 next_step="Cut the bag into two episodes of one recording",
             )
         begin = stamps[-1]
