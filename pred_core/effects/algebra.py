@@ -8,7 +8,7 @@ in which a `Lane` is one float on CUDA and sixteen worlds side by side in one SI
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Union
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -74,7 +74,7 @@ class Traced:
         return self._binary(other, ">", kind="auto")
 
 
-Scalar = Union[Traced, Tensor, float]
+Scalar = Traced | Tensor | float
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def cos(a: Any) -> Any:
 def where(condition: Any, a: Any, b: Any) -> Any:
     """`a` where the condition holds, else `b`, per world."""
     if isinstance(condition, Traced):
-        return condition.code.emit(f"lane_select({condition.name}, {_lane(a)}, {_lane(b)})")
+        return condition.code.emit(f"lane_select({condition.name}, {lane_text(a)}, {lane_text(b)})")
     return torch.where(condition, torch.as_tensor(a, dtype=_dtype(a, b)), torch.as_tensor(b, dtype=_dtype(a, b)))
 
 
@@ -165,9 +165,10 @@ def _text(value: Scalar) -> str:
     if isinstance(value, Traced):
         return value.name
     if isinstance(value, (int, float)):
-        return _lane(value)
+        return lane_text(value)
     raise TypeError(f"a law cannot mix traced values with {type(value).__name__}")
 
 
-def _lane(value: Scalar) -> str:
+def lane_text(value: Scalar) -> str:
+    """C++ text of a traced value or a number."""
     return value.name if isinstance(value, Traced) else f"Lane({float(value)!r}f)"

@@ -31,14 +31,21 @@ class ModelArrays:
     def of(body: Body, scene: Scene, device: str) -> ModelArrays:
         """Everything of `Model` that does not change from call to call."""
         shapes = np.array([_SHAPES[type(f)] for f in scene.fixtures], dtype=np.int32)
-        fixtures = np.array([fixture_row(f) for f in scene.fixtures], dtype=np.float32).reshape(-1, 16)
-        floats = {
+        fixtures = np.array([fixture_row(f) for f in scene.fixtures], dtype=np.float64).reshape(-1, 16)
+        floats: dict[str, Array] = {
             "spring_data": spring_rows(body),
             "bend_data": bend_rows(body),
             "particle_data": np.stack((body.friction_scale, body.arc), axis=1),
             "fixture_data": fixtures,
         }
-        integers = {"springs": body.springs, "bends": bend_entries(body), "fixture_shape": shapes, "pairs": shapes[:0]}
+        lines = chains(body)
+        integers: dict[str, NDArray[np.int32]] = {
+            "springs": body.springs,
+            "bends": body.bends,
+            "chains": lines,
+            "fixture_shape": shapes,
+        }
+        arrays: dict[str, Any]
         arrays = {k: wp.array(v.astype(np.float32).ravel(), dtype=wp.float32, device=device) for k, v in floats.items()}
         arrays |= {k: wp.array(v.astype(np.int32).ravel(), dtype=wp.int32, device=device) for k, v in integers.items()}
         gx, gy, gz = scene.gravity
@@ -47,7 +54,7 @@ class ModelArrays:
             "spring_count": len(body.springs),
             "bend_count": len(body.bends),
             "fixture_count": len(shapes),
-            "pair_count": 0,
+            "chain_count": len(lines),
             "has_ground": int(scene.ground is not None),
             "ground": scene.ground or 0.0,
             "gravity_x": gx,
@@ -68,31 +75,38 @@ class ModelArrays:
 
 
 def spring_rows(body: Body) -> Array:
-    """(S, 5): 1/l0, l0, stiffness scale, damping scale, arc of the middle."""
+    """(5, S): 1/l0, l0, stiffness scale, damping scale, arc of the middle."""
     arc = body.arc[body.springs].mean(axis=1)
-    return np.stack((1.0 / body.rest_length, body.rest_length, body.stiffness_scale, body.damping_scale, arc), axis=1)
+    return np.stack((1.0 / body.rest_length, body.rest_length, body.stiffness_scale, body.damping_scale, arc))
 
 
 def bend_rows(body: Body) -> Array:
-    """(B, 4): scale/lbar, lbar [m] (half of the two edges), arc, share of the line's twist."""
+    """(B, 4): scale/lbar, lbar [m] (half of the two edges), arc, share of its line's twist."""
     if len(body.bends) == 0:
         return np.zeros((0, 4))
+    lbar = bend_lengths(body)
+    share = np.concatenate([lbar[a:b] / lbar[a:b].sum() for a, b in chains(body)])
+    return np.stack((body.bend_scale / lbar, lbar, body.arc[body.bends[:, 1]], share), axis=1)
+
+
+def bend_lengths(body: Body) -> Array:
+    """(B,) [m] half the sum of a bend's two edges at rest: a spring's rest length, or the distance."""
     rest = {tuple(p): length for p, length in zip(body.springs.tolist(), body.rest_length.tolist(), strict=True)}
 
     def edge(a: int, b: int) -> float:
         fallback = float(np.linalg.norm(body.rest_position[b] - body.rest_position[a]))
         return rest.get((min(a, b), max(a, b)), fallback)
 
-    lbar = np.array([0.5 * (edge(a, b) + edge(b, c)) for a, b, c in body.bends.tolist()])
-    return np.stack((body.bend_scale / lbar, lbar, body.arc[body.bends[:, 1]], lbar / lbar.sum()), axis=1)
+    return np.array([0.5 * (edge(a, b) + edge(b, c)) for a, b, c in body.bends.tolist()])
 
 
-def bend_entries(body: Body) -> NDArray[np.int32]:
-    """(B, 4): before, at, after, 1 where the bend does not continue the one before it in the list."""
-    starts = np.ones(len(body.bends), dtype=np.int32)
-    if len(body.bends) > 1:
-        starts[1:] = ~(body.bends[1:, :2] == body.bends[:-1, 1:]).all(axis=1)
-    return np.concatenate((body.bends, starts[:, None]), axis=1).astype(np.int32)
+def chains(body: Body) -> NDArray[np.int32]:
+    """(K, 2) first bend and one past the last of each line: runs of bends that continue each other."""
+    if len(body.bends) == 0:
+        return np.zeros((0, 2), dtype=np.int32)
+    continues = (body.bends[1:, :2] == body.bends[:-1, 1:]).all(axis=1)
+    edges = np.concatenate(([0], np.flatnonzero(~continues) + 1, [len(body.bends)]))
+    return np.stack((edges[:-1], edges[1:]), axis=1).astype(np.int32)
 
 
 def fixture_row(fixture: Fixture) -> list[float]:

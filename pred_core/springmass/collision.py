@@ -8,15 +8,23 @@ from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pred_core.types import Body
+from pred_core.types import Body, Grip, State
 
 NEAR_RINGS = 3  # springs away along the object within which particles never collide
 
 
-def candidate_pairs(body: Body, position: Tensor, velocity: Tensor, period: float) -> Tensor:
-    """(C, 2) int32 pairs that could come within two radii in `period` [s], over all worlds (W, N, 3)."""
-    speed = float(velocity.norm(dim=-1).max())
-    reach = 2.0 * body.radius + 2.0 * speed * period
+def candidate_pairs(body: Body, state: State, before: Grip, grips: Grip, period: float) -> Tensor:
+    """(C, 2) int32 pairs that could come within two radii in the first `period` [s], over all worlds.
+
+    Speeds are taken from the state (W, N, 3) and from the grippers' way; a radius a particle is left for what
+    they gain within the period. Worlds that diverged are left out.
+    """
+    alive = torch.isfinite(state.position + state.velocity).all(-1).all(-1)
+    position, velocity = state.position[alive], state.velocity[alive]
+    speed = float(velocity.norm(dim=-1).max()) if velocity.numel() else 0.0
+    if grips.position.numel():
+        speed = max(speed, float((grips.position[0] - before.position).norm(dim=-1).max()) / period)
+    reach = 4.0 * body.radius + 2.0 * speed * period
     found = [cKDTree(world).query_pairs(reach, output_type="ndarray") for world in position.cpu().double().numpy()]
     pairs = np.unique(np.sort(np.concatenate(found), axis=1), axis=0) if found else np.zeros((0, 2), dtype=np.int64)
     if len(pairs):

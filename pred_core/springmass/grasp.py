@@ -20,17 +20,51 @@ def grip_offsets(position: Tensor, held: Tensor, grip: Grip) -> Tensor:
 
 
 def check_grip(grip: Grip, worlds: int, held: Tensor) -> None:
-    """Raise InputError unless poses are finite, rotations unit, and every held index has a gripper."""
+    """Raise InputError unless poses are finite, rotations unit, and every held index has a gripper.
+
+    `grip` has one leading axis, of `worlds` or of any length (then `worlds` is that length).
+    """
     if grip.position.shape[0] != worlds:
         raise InputError("gripper poses", got=f"{grip.position.shape[0]} worlds", allowed=f"{worlds} as the state")
-    if not (torch.isfinite(grip.position).all() and torch.isfinite(grip.rotation).all()):
-        raise InputError("gripper pose is not finite", next_step="Stop the arm; check the source of gripper/pose")
-    norm = grip.rotation.norm(dim=-1)
-    if grip.rotation.numel() and bool((norm - 1.0).abs().max() > 1e-2):
-        raise InputError("gripper rotation is not a unit quaternion (wxyz)", got=f"norm {float(norm.min()):.3g}")
+    check_poses(grip)
     most = int(held.max()) if held.numel() else -1
     if most >= grip.position.shape[1]:
         raise InputError("held gripper index", got=most, allowed=f"below {grip.position.shape[1]} grippers")
+
+
+def check_poses(grip: Grip) -> None:
+    """Raise InputError unless every pose is finite and every rotation a unit quaternion."""
+    if not grip.rotation.numel():
+        return
+    error = (grip.rotation.square().sum(-1) - 1.0).abs().max()
+    if not bool((error <= 2e-2) & grip.position.sum().isfinite()):
+        if not bool(torch.isfinite(error + grip.position.sum())):
+            raise InputError("gripper pose is not finite", next_step="Stop the arm; check the source of gripper/pose")
+        off = f"norm off by {0.5 * float(error):.3g}"
+        raise InputError("gripper rotation is not a unit quaternion (wxyz)", got=off)
+
+
+def flatten_grip(grip: Grip, lead: torch.Size, device: str) -> Grip:
+    """Poses with leading axes `lead` (or fewer, then the same for all) as one leading axis, float32.
+
+    Raises: InputError if a shape or type does not fit.
+    """
+    g = grip.position.shape[-2] if grip.position.dim() >= 2 else -1
+    count, axes = lead.numel(), tuple(lead)
+    shapes = (tuple(grip.position.shape), tuple(grip.rotation.shape), tuple(grip.closed.shape))
+    fits = grip.position.shape[-2:] == (g, 3) and grip.rotation.shape[-2:] == (g, 4) and grip.closed.shape[-1:] == (g,)
+    if not (fits and grip.position.is_floating_point() and grip.rotation.is_floating_point()):
+        raise InputError("gripper poses", got=f"position, rotation, closed of shapes {shapes}",
+                         allowed=f"{axes} + (G, 3), (G, 4) floats and (G,)")  # fmt: skip
+    try:
+        return Grip(
+            grip.position.expand(*lead, g, 3).reshape(count, g, 3).to(device, torch.float32),
+            grip.rotation.expand(*lead, g, 4).reshape(count, g, 4).to(device, torch.float32),
+            grip.closed.expand(*lead, g).reshape(count, g).to(device, torch.bool),
+        )
+    except RuntimeError as error:
+        raise InputError("gripper poses do not fit the state", got=f"shapes {shapes}",
+                         allowed=f"leading axes {axes}") from error  # fmt: skip
 
 
 def close_and_open(state: State, before: Grip, closed: Tensor, radius: float) -> tuple[Tensor, Tensor]:

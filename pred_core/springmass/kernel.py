@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from pred_core.effects.algebra import Code, Traced, Vec3
+from pred_core.effects.algebra import Code, Traced, Vec3, lane_text
 from pred_core.effects.effect import (
     BendContext,
     ContactContext,
@@ -17,13 +17,11 @@ from pred_core.effects.effect import (
     ParticleContext,
     SpringContext,
 )
-from pred_core.springmass import source
+from pred_core.springmass import source, source_bending, source_contact
 
 SIMD_LANES = 16  # worlds side by side on CPU
-wp.config.quiet = True
 wp.config.log_level = 30
 BASE_PARAMETERS = 4  # stiffness, damping, friction, bending_stiffness
-FRAME_START = "fresh = m.time == 0.0f && period == 0 && sub == 0; if (B) start_frame(period, alpha);"
 
 
 @wp.struct
@@ -39,6 +37,7 @@ class Model:
     fixture_data: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     pairs: wp.array(dtype=wp.int32)  # type: ignore[valid-type]
     held: wp.array(dtype=wp.int32)  # type: ignore[valid-type]
+    chains: wp.array(dtype=wp.int32)  # type: ignore[valid-type]
     particles: wp.int32
     spring_count: wp.int32
     bend_count: wp.int32
@@ -46,18 +45,20 @@ class Model:
     held_count: wp.int32
     fixture_count: wp.int32
     pair_count: wp.int32
+    chain_count: wp.int32
+    blocks: wp.int32
     parameter_count: wp.int32
     memory_count: wp.int32
     periods: wp.int32
     substeps: wp.int32
     masked: wp.int32
     has_ground: wp.int32
+    loose: wp.int32  # some line is held at neither end
     stage: wp.int32
     stage_sub: wp.int32
     substep: wp.float32  # [s]
     inverse_substeps: wp.float32
     inverse_period: wp.float32  # [1/s]
-    time: wp.float32  # [s] at the start of the call
     gravity_x: wp.float32
     gravity_y: wp.float32
     gravity_z: wp.float32
@@ -75,13 +76,16 @@ class Worlds:
     velocity: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     force: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     mass: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
+    inverse_mass: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     parameters: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     spring_mask: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     held_mask: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     held_offset: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
+    held_lever: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     grips: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     frame_grip: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     memory: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
+    time: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     clock: wp.array(dtype=wp.int32)  # type: ignore[valid-type]
     trajectory_out: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
 
@@ -91,30 +95,49 @@ def parameter_count(effects: tuple[type[Effect], ...]) -> int:
     return BASE_PARAMETERS + sum(q.size for e in effects for q in e.parameters)
 
 
+def stride(lanes: int, staged: bool) -> int:
+    """Floats a particle takes per lane: four where one world runs eight springs at a time, else three."""
+    return 4 if lanes == 1 and not staged else 3
+
+
+def kernel_text(effects: tuple[type[Effect], ...], lanes: int, staged: bool) -> str:
+    """The C++ of the native function, every placeholder filled."""
+    framed = any("bend" in e.hooks for e in effects)
+    eight = stride(lanes, staged) == 4
+    text = "\n".join(
+        (source.PRELUDE, source_bending.FRAME if framed else "", source.SPRING, source.SPRING_EIGHT if eight else "",
+         source_bending.BEND, source_contact.CONTACT, source_contact.SELF_COLLISION, source_contact.PARTICLE,
+         source_contact.HELD, source.STAGED if staged else source.FUSED)
+    )  # fmt: skip
+    parts = {
+        "@SPRING_LAW@": source.SPRING_LAW,
+        "@VECTOR_FUNCTIONS@": source.VECTOR_FUNCTIONS,
+        "@SCALAR@": "1" if lanes == 1 else "0",
+        "@LANES@": str(lanes),
+        "@STRIDE@": str(stride(lanes, staged)),
+        "@ALL_SPRINGS@": source.ALL_SPRINGS_EIGHT if eight else source.ALL_SPRINGS,
+        "@ALL_BENDS@": source_bending.ALL_BENDS_FRAMED if framed else source_bending.ALL_BENDS,
+        "@ONE_BEND@": source_bending.ONE_BEND_FRAMED if framed else source_bending.ONE_BEND,
+        "@BEND_FRAME@": source_bending.BEND_FRAME if framed else "",
+        "@BEND_MOMENT@": source_bending.BEND_MOMENT if framed else "",
+    }
+    for placeholder, statements in (*parts.items(), *_laws(effects).items()):
+        text = text.replace(placeholder, statements)
+    return text
+
+
 @lru_cache(maxsize=64)
 def build(effects: tuple[type[Effect], ...], lanes: int, staged: bool) -> Callable[..., Any]:
     """The kernel `k(model, worlds)`; grid (blocks,) fused, (blocks, elements) staged. Compiled once, cached."""
-    body = source.FUSED if not staged else source.STAGED
-    framed = any("bend" in e.hooks for e in effects)
-    text = "\n".join(
-        (source.PRELUDE, source.FRAME if framed else "", source.SPRING, source.BEND, source.CONTACT, source.SELF_COLLISION, source.PARTICLE,
-         source.HELD, body)
-    )  # fmt: skip
-    text = text.replace("@SCALAR@", "1" if lanes == 1 else "0").replace("@LANES@", str(lanes))
-    text = text.replace("@BEND_FRAME@", source.BEND_FRAME if framed else "")
-    text = text.replace("@BEND_MOMENT@", source.BEND_MOMENT if framed else "")
-    text = text.replace("@BEND_START@", FRAME_START if framed else "")
-    for placeholder, statements in _laws(effects).items():
-        text = text.replace(placeholder, statements)
 
     def advance(m: Model, w: Worlds, block: wp.int32, element: wp.int32): ...
 
-    native = wp.func_native(text)(advance)
+    native: Any = wp.func_native(kernel_text(effects, lanes, staged))(advance)
 
     if staged:
 
         def substep_stage(m: Model, w: Worlds):
-            block, element = wp.tid()
+            block, element = wp.tid()  # type: ignore[misc]
             native(m, w, block, element)
 
         entry = substep_stage
@@ -180,20 +203,20 @@ def _force(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
         time=_value(code, "time"),
     )
     f = effect.force(p, at)
-    return [f"fx += {f.x.name}; fy += {f.y.name}; fz += {f.z.name};"]
+    return [f"f{k} += {lane_text(v)};" for k, v in zip("xyz", (f.x, f.y, f.z), strict=True)]
 
 
 def _spring(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
     at = SpringContext(
         length=_value(code, "length"),
-        rest_length=_value(code, "Lane(e[1])"),
+        rest_length=_value(code, "Lane(spring(1))"),
         rate=_value(code, "rate"),
         stiffness=_value(code, "k"),
         damping=_value(code, "c"),
-        arc=_value(code, "Lane(e[4])"),
+        arc=_value(code, "Lane(spring(4))"),
         time=_value(code, "time"),
     )
-    return [f"tension += {effect.spring(p, at).name};"]
+    return [f"tension += {lane_text(effect.spring(p, at))};"]
 
 
 def _contact(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
@@ -204,7 +227,7 @@ def _contact(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
         time=_value(code, "time"),
     )
     friction, height = effect.contact(p, at)
-    lines = [f"mu += {friction.name};"] if isinstance(friction, Traced) else []
+    lines = [f"mu = lane_max(mu + {friction.name}, zero);"] if isinstance(friction, Traced) else []
     return lines + ([f"ground += {height.name};"] if isinstance(height, Traced) else [])
 
 
@@ -216,33 +239,34 @@ def _boundary(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
         Vec3(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
     speed = [code.emit(f"(g1[{k}] - g0[{k}]) * m.inverse_period") for k in range(3)]
+    place = [code.emit(f"beta * g0[{k}] + alpha * g1[{k}]") for k in range(3)]
     at = GripContext(
-        position=_vector(code, "x", "y", "z"),
+        position=Vec3(*place) + _vector(code, "rx", "ry", "rz"),
         velocity=Vec3(*speed),
         lever=_vector(code, "lx", "ly", "lz"),
         axes=axes,
         time=_value(code, "time"),
     )
     d = effect.boundary(p, at)
-    return [f"x += {d.x.name}; y += {d.y.name}; z += {d.z.name};"]
+    return [f"r{k} += {lane_text(v)};" for k, v in zip("xyz", (d.x, d.y, d.z), strict=True)]
 
 
 def _bend(code: Code, p: dict[str, Any], effect: type[Effect], slot: int) -> list[str]:
-    """Moments in the director frame; memory slots of the effect follow the two of the curvature."""
-    places = [f"memory[1 + (2 + {slot + k}) * B + b]" for k in range(effect.bend_memory)]
-    held = [code.emit(f"(fresh ? zero : {place})") for place in places]
+    """Moments along the directors; an effect's memory slots follow the two of the curvature."""
+    places = [f"memory[4 * K + (2 + {slot + k}) * B + b]" for k in range(effect.bend_memory)]
+    held = [code.emit(f"lane_select(fresh > zero, zero, {place})") for place in places]
     at = BendContext(
         curvature=(_value(code, "k1"), _value(code, "k2")),
         change=(_value(code, "change1"), _value(code, "change2")),
         weight=_value(code, "weight"),
-        bends=_value(code, "Lane((float)B)"),
+        bends=_value(code, "line_bends"),
         substep=_value(code, "Lane(h)"),
         arc=_value(code, "Lane(e[2])"),
         memory=tuple(held),
     )
     first, second, memory = effect.bend(p, at)
-    kept = [f"{place} = {value.name};" for place, value in zip(places, memory, strict=True)]
-    return [f"moment1 += {first.name}; moment2 += {second.name};", *kept]
+    kept = [f"{place} = {lane_text(value)};" for place, value in zip(places, memory, strict=True)]
+    return [f"moment1 += {lane_text(first)}; moment2 += {lane_text(second)};", *kept]
 
 
 @wp.kernel(enable_backward=False)
@@ -251,7 +275,7 @@ def _tick(clock: wp.array(dtype=wp.int32)):  # type: ignore[valid-type]
 
 
 def launch_staged(
-    run: Any, model: Any, record: Any, blocks: int, periods: int, substeps: int, device: str, sizes: tuple[int, ...]
+    run: Any, model: Any, record: Any, periods: int, device: str, sizes: tuple[int, ...]
 ) -> None:
     """Launches of springs, bends and pairs, particles and held a substep; `sizes` are their element counts.
 
@@ -260,13 +284,13 @@ def launch_staged(
     """
 
     def one_period() -> None:
-        for sub in range(substeps):
+        for sub in range(model.substeps):
             for stage, size in enumerate(sizes):
                 if size:
                     model.stage, model.stage_sub = stage, sub
-                    wp.launch(run, dim=(blocks, size), inputs=[model, record], device=device)
+                    wp.launch(run, dim=(model.blocks, size), inputs=[model, record], device=device)
         model.stage = len(sizes)
-        wp.launch(run, dim=(blocks, 3 * model.particles), inputs=[model, record], device=device)
+        wp.launch(run, dim=(model.blocks, 3 * model.particles), inputs=[model, record], device=device)
         wp.launch(_tick, dim=1, inputs=[record.clock], device=device)
 
     if not wp.get_device(device).is_cuda:

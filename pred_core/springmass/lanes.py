@@ -9,18 +9,25 @@ from torch import Tensor
 def pack(values: Tensor, lanes: int) -> Tensor:
     """(W, ...) to contiguous float32 (blocks, ..., lanes); the last world fills unused lanes."""
     worlds = values.shape[0]
-    blocks = -(-worlds // lanes)
+    packed = torch.empty(-(-worlds // lanes), *values.shape[1:], lanes, device=values.device)
+    pack_into(packed, values)
+    return packed
+
+
+def pack_into(packed: Tensor, values: Tensor) -> None:
+    """Fill `packed` (blocks, ..., lanes) from (W, ...)."""
+    blocks, lanes = packed.shape[0], packed.shape[-1]
     if lanes == 1:
-        return values.to(torch.float32).contiguous().unsqueeze(-1)
-    missing = blocks * lanes - worlds
+        packed.squeeze(-1).copy_(values)
+        return
+    missing = blocks * lanes - values.shape[0]
     if missing:
         values = torch.cat((values, values[-1:].expand(missing, *values.shape[1:])))
-    return values.to(torch.float32).reshape(blocks, lanes, *values.shape[1:]).movedim(1, -1).contiguous()
+    packed.movedim(-1, 1).copy_(values.unflatten(0, (blocks, lanes)))
 
 
-def unpack(packed: Tensor, worlds: int, lane_axis: int = -1, block_axis: int = 0) -> Tensor:
-    """The inverse of `pack`: (blocks, ..., lanes) to (W, ...)."""
-    moved = packed.movedim(lane_axis, block_axis + 1)
-    shape = list(moved.shape)
-    shape[block_axis : block_axis + 2] = [shape[block_axis] * shape[block_axis + 1]]
-    return moved.reshape(shape).narrow(block_axis, 0, worlds)
+def unpack(packed: Tensor, worlds: int) -> Tensor:
+    """A copy (W, ...) of packed (blocks, ..., lanes)."""
+    if packed.shape[-1] == 1:
+        return packed.squeeze(-1).clone()
+    return packed.movedim(-1, 1).flatten(0, 1)[:worlds].clone(memory_format=torch.contiguous_format)

@@ -91,7 +91,7 @@ def union_topology(position: Array, widest: float, most: int) -> tuple[Springs, 
     particle. A candidate's springs are `least[:, m-1] & (length <= threshold)`: greedy insertion by length
     makes a smaller threshold a prefix of a larger one.
     """
-    sets = [{tuple(p) for p in greedy_springs(position, widest, m).tolist()} for m in range(1, most + 1)]
+    sets = [{(i, j) for i, j in greedy_springs(position, widest, m).tolist()} for m in range(1, most + 1)]
     union = np.array(sorted(set().union(*sets)), dtype=np.int32).reshape(-1, 2)
     member = np.array([[tuple(p) in s for s in sets] for p in union.tolist()], dtype=np.int32).reshape(len(union), most)
     return union, member
@@ -133,7 +133,8 @@ def straight_bends(position: Array, springs: Springs) -> Springs:
         d = d / np.linalg.norm(d, axis=1, keepdims=True)
         cosine = d @ d.T
         used: set[int] = set()
-        for a, b in sorted(zip(*np.triu_indices(len(around), 1), strict=True), key=lambda ab: cosine[ab]):
+        every = np.stack(np.triu_indices(len(around), 1), axis=1).tolist()
+        for a, b in sorted(every, key=lambda ab: cosine[ab[0], ab[1]]):
             if cosine[a, b] > STRAIGHT:
                 break
             if a not in used and b not in used:

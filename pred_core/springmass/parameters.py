@@ -1,0 +1,62 @@
+"""What each world is made of: its Physics and extensions as rows of numbers for the kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from pred_core.effects import find_effect
+from pred_core.effects.effect import Effect
+from pred_core.errors import ConfigError
+from pred_core.twin import Extension
+from pred_core.types import Physics
+
+PerWorld = list[tuple[Extension, ...]]
+
+
+def extensions_per_world(extensions: Sequence[Extension] | Sequence[Sequence[Extension]], worlds: int) -> PerWorld:
+    """One tuple for all worlds, or one per world. Raises: ConfigError if their number is not that of Physics."""
+    lists: PerWorld = []
+    for entry in extensions:
+        if not isinstance(entry, Extension):
+            lists.append(tuple(entry))
+    if not lists:
+        return [tuple(e for e in extensions if isinstance(e, Extension))]
+    if len(lists) != len(extensions) or worlds not in (1, len(lists)):
+        raise ConfigError("extensions per world", got=len(lists), allowed=f"{worlds}, as Physics")
+    return lists
+
+
+def effects_of(per_world: PerWorld) -> tuple[type[Effect], ...]:
+    """The effects every world has. Raises: ConfigError if they differ, TwinError if a value is out of bounds."""
+    ids = [[e.id for e in extensions] for extensions in per_world]
+    if any(i != ids[0] for i in ids) or len(set(ids[0])) != len(ids[0]):
+        raise ConfigError("extensions", got=ids[0], allowed="the same effects in every world, each once")
+    effects = tuple(find_effect(i) for i in ids[0])
+    for extensions in per_world:
+        for effect, extension in zip(effects, extensions, strict=True):
+            effect.check(extension)
+    return effects
+
+
+def bend_bounds(per_world: PerWorld, worlds: int) -> list[tuple[float, float]]:
+    """Relative bending stiffness and bending damping time [s] that each world's effects add."""
+    bounds = []
+    for extensions in per_world:
+        pairs = [find_effect(e.id).bend_bound({k: v[0] for k, v in e.parameters.items()}) for e in extensions]
+        bounds.append((sum(p[0] for p in pairs), sum(p[1] for p in pairs)))
+    return [bounds[w % len(bounds)] for w in range(worlds)]
+
+
+def parameter_rows(physics: list[Physics], per_world: PerWorld, effects: tuple[type[Effect], ...]) -> Tensor:
+    """(W, Q) float32: base parameters, then each effect's in declared order."""
+    rows = []
+    for w in range(max(len(physics), len(per_world))):
+        p = physics[w % len(physics)]
+        row = [p.stiffness, p.damping, p.ground_friction, p.bending_stiffness]
+        for effect, extension in zip(effects, per_world[w % len(per_world)], strict=True):
+            row += [v for q in effect.parameters for v in extension.parameters[q.name]]
+        rows.append(row)
+    return torch.tensor(rows, dtype=torch.float32)
