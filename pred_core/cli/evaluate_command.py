@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pred_core.bag.dataset import Dataset, load_dataset
+from pred_core.bag.gate import examine_all
 from pred_core.errors import ConfigError
 from pred_core.evaluate.cache import PredictionCache
 from pred_core.evaluate.evaluation import EpisodeStore, Result, run_all
@@ -56,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
     progress = _Progress(sum(len(s.folds) for s in splits) * len(models))
     results, missing = run_all(models, optional, splits, store, PredictionCache(args.out / "cache"), progress)
     command = "pred " + shlex.join(["evaluate", *_words(args)])
-    numbers = metrics_json(dataset, results, missing, args.seed, command)
+    gate = examine_all(store.known)
+    numbers = metrics_json(dataset, results, missing, gate, args.seed, command)
     write_json(args.out / "metrics.json", numbers)
     write_report(args.out / "report.html", dataset, results, numbers, twins)
     _print_table(dataset, results, numbers["entries"])

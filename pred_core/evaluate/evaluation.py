@@ -60,6 +60,10 @@ class EpisodeStore:
                 self._read[entry.bag] = self.dataset.read(entry)
         return [self._read[e.bag] for e in entries]
 
+    def known(self) -> list[Episode]:
+        """Every episode read so far."""
+        return list(self._read.values())
+
 
 def run_model(model: Model, split: Split, store: EpisodeStore, cache: PredictionCache, say: Progress) -> Result:
     """Predict and score every fold of `split`. Raises: PredError of the model or the data."""
@@ -133,6 +137,7 @@ def entry(result: Result, seed: int) -> dict[str, Any]:
         "folds": len(result.split.folds),
         "episodes_tested": len(result.scores),
         "diverged": [{"episode": s.name, "step": s.diverged} for s in result.scores if s.diverged is not None],
+        "data_sha256": [fold.digest for fold in result.split.folds],
         "hidden_particle_frames": sum(s.hidden for s in result.scores),
         "tested_on_training_data": result.tested_on_training_data,
         "episodes_sharing_a_recording_with_training": result.same_recording,

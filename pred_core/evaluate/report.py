@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pred_core.bag.dataset import Dataset
+from pred_core.bag.gate import EpisodeQuality
 from pred_core.evaluate import pictures
 from pred_core.evaluate.evaluation import NotComputed, Result, entry
 from pred_core.evaluate.models import NamedTwin
@@ -27,7 +28,12 @@ CM = 100.0
 
 
 def metrics_json(
-    dataset: Dataset, results: Sequence[Result], missing: Sequence[NotComputed], seed: int, command: str
+    dataset: Dataset,
+    results: Sequence[Result],
+    missing: Sequence[NotComputed],
+    gate: Sequence[EpisodeQuality],
+    seed: int,
+    command: str,
 ) -> dict[str, Any]:
     """What `metrics.json` holds."""
     return {
@@ -45,6 +51,11 @@ def metrics_json(
         "not_computed": [
             *({"model": m.model, "split": m.split, "reason": m.reason} for m in missing),
             *({"metric": name, "reason": f"{NOT_COMPUTED}: no rendered images"} for name in _IMAGE_METRICS),
+        ],
+        "flagged_episodes": [
+            {"episode": q.name, "split": q.split, "recording": q.recording, "flags": list(q.flags)}
+            for q in gate
+            if q.flags
         ],
         "entries": [entry(r, seed) for r in results],
     }
@@ -78,6 +89,7 @@ def write_report(
         _tables(page, entries)
         _not_computed(page, [m for m in numbers["not_computed"] if m.get("split") == split])
         _figures(page, chosen, path.parent / "figures", split)
+    _gate(page, numbers["flagged_episodes"], results)
     for named in twins:
         add_parameters(page, named)
     page.heading("Definitions")
@@ -129,6 +141,22 @@ def _tables(page: Page, entries: Sequence[dict[str, Any]]) -> None:
                      "this split leaks; the one grouped by recording does not.")
     for note in notes:
         page.text(note, note=True)
+
+
+def _gate(page: Page, flagged: Sequence[dict[str, Any]], results: Sequence[Result]) -> None:
+    """What the data gate flags, beside the error of the main model there. Nothing is left out because of it."""
+    page.heading("Data gate")
+    if not flagged:
+        page.text("No episode is flagged.")
+        return
+    main = main_result(results)
+    values = main.values("coordinate_l1")
+    page.text(f"Flagged, none left out of a score. Error: {main.model.name} on {main.split.name}.", note=True)
+    rows = [
+        (f["episode"], f["split"], f["recording"], number(_scaled(values.get(f["episode"]))), "; ".join(f["flags"]))
+        for f in flagged
+    ]
+    page.table(("episode", "split", "recording", "error [cm]", "what was found"), rows)
 
 
 def _not_computed(page: Page, missing: Sequence[dict[str, Any]]) -> None:
