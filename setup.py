@@ -78,6 +78,7 @@ setup(
         "console_scripts": [
             "pred = pred_core.cli.main:main",
             "pred_replay = pred_ros.replay:main",
+            "pred_bringup = pred_ros.bringup:main",
             *(f"{name} = pred_ros.{name}_node:main" for name in NODES),
         ]
     },

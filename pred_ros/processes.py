@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -17,6 +20,10 @@ from pred_ros.resources import fastdds_profile
 
 NODES = ("player", "predictor", "evaluator")
 POLITE = 4.0  # [s] between SIGINT and SIGKILL
+
+# DDS-RTPS 9.6.2.3: port of the first participant's discovery = 7400 + 250 domain + 10.
+_PORT_BASE, _PORTS_A_DOMAIN, _FIRST_UNICAST = 7400, 250, 10
+_draws = itertools.count()
 
 # The ROS wheels re-execute the interpreter once to set LD_LIBRARY_PATH and mark it done with this variable;
 # a child in another environment must do it again.
@@ -36,8 +43,20 @@ def node_environment(domain: int | None = None) -> dict[str, str]:
 
 
 def free_domain() -> int:
-    """A domain for one run, 1 to 100, drawn from the process id so that two runs beside each other differ."""
-    return 1 + os.getpid() % 100
+    """A ROS domain, 1 to 100, in which nobody on this machine has opened a participant yet.
+
+    The search begins at a place drawn from the process id, so that runs started together differ.
+    Raises: ConfigError if all are taken.
+    """
+    for k in range(100):
+        domain = 1 + (os.getpid() * 13 + next(_draws) + k) % 100
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("", _PORT_BASE + _PORTS_A_DOMAIN * domain + _FIRST_UNICAST))
+            except OSError:
+                continue
+            return domain
+    raise ConfigError("no free ROS domain on this machine", allowed="1 to 100")
 
 
 def node_command(node: str, parameters: Mapping[str, object]) -> list[str]:
@@ -71,6 +90,7 @@ class Children:
     environment: Mapping[str, str]
     logs: Path
     running: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
+    polite: float = POLITE  # [s]
 
     def __enter__(self) -> Children:
         self.logs.mkdir(parents=True, exist_ok=True)
@@ -99,21 +119,17 @@ class Children:
         return lines[-1] if lines else ""
 
     def end(self) -> None:
-        """SIGINT to all, then SIGKILL to the process groups of those that stay."""
-        alive = [p for p in self.running.values() if p.poll() is None]
-        for process in alive:
+        """SIGINT to all, then SIGKILL to what stays of their process groups."""
+        for process in self.running.values():
             _signal_group(process, signal.SIGINT)
-        deadline = time.monotonic() + POLITE
-        for process in alive:
-            try:
+        deadline = time.monotonic() + self.polite
+        for process in self.running.values():
+            with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(max(0.0, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                _signal_group(process, signal.SIGKILL)
-                process.wait()
+            _signal_group(process, signal.SIGKILL)
+            process.wait()
 
 
 def _signal_group(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
-    try:
+    with contextlib.suppress(ProcessLookupError):  # all of it ended in the meantime
         os.killpg(process.pid, number)
-    except ProcessLookupError:
-        return  # it ended in the meantime

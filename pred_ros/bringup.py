@@ -1,0 +1,84 @@
+"""Starts any set of nodes from one YAML, without launch: `pred_bringup FILE [NODE.PARAMETER=VALUE ...]`.
+
+FILE is an ordinary ROS parameter file whose top-level keys are the nodes to start. The nodes run until one fails,
+all have ended, or SIGINT or SIGTERM comes; then all of them are ended.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pred_core.cli.main import BAD_INPUT
+from pred_core.config import load_yaml
+from pred_core.errors import ConfigError, PredError, nearest
+from pred_ros.processes import NODES, Children, node_command, node_environment
+
+PARAMETERS = "ros__parameters"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point. Returns 0 when every node ended well or a signal came, 2 on bad input, else a node's code."""
+    parser = argparse.ArgumentParser(prog="pred_bringup", description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("file", type=Path, help="ROS parameter file, e.g. config/nodes/replay.yaml")
+    parser.add_argument("overrides", nargs="*", metavar="NODE.PARAMETER=VALUE")
+    parser.add_argument("--domain", type=int, help="run in this ROS domain on this machine only")
+    parser.add_argument("--logs", type=Path, help="folder for the nodes' output; default: a temporary one")
+    args = parser.parse_args(argv)
+    try:
+        return run(read_nodes(args.file, args.overrides), args.domain, args.logs)
+    except PredError as error:
+        print(f"pred_bringup: {error}", file=sys.stderr)
+        return BAD_INPUT
+
+
+def read_nodes(file: Path, overrides: Sequence[str] = ()) -> dict[str, dict[str, Any]]:
+    """Node -> parameters. Raises: ConfigError for another layout, an unknown node or a malformed override."""
+    content = load_yaml(file)
+    if not isinstance(content, dict) or not content:
+        raise ConfigError(f"{file}: no nodes", allowed=", ".join(NODES))
+    nodes: dict[str, dict[str, Any]] = {}
+    for name, entry in content.items():
+        if name not in NODES:
+            raise ConfigError(f"{file}: unknown node '{name}'", next_step=nearest(str(name), NODES))
+        if not isinstance(entry, dict) or set(entry) != {PARAMETERS} or not isinstance(entry[PARAMETERS] or {}, dict):
+            raise ConfigError(f"{file}: {name}", got=repr(entry)[:80], allowed=f"a mapping '{PARAMETERS}'")
+        nodes[name] = dict(entry[PARAMETERS] or {})
+    for override in overrides:
+        target, equals, value = override.partition("=")
+        node, dot, parameter = target.partition(".")
+        if not equals or not dot or node not in nodes:
+            raise ConfigError(f"override '{override}'", allowed=f"NODE.PARAMETER=VALUE with {', '.join(nodes)}")
+        nodes[node][parameter] = yaml.safe_load(value)
+    return nodes
+
+
+def run(nodes: dict[str, dict[str, Any]], domain: int | None, logs: Path | None) -> int:
+    """Start the nodes and wait for them. Raises: ConfigError."""
+    asked: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda received, _: asked.append(received))
+    folder = logs or Path(tempfile.mkdtemp(prefix="pred_bringup_"))
+    print(f"pred_bringup: {', '.join(nodes)}; output in {folder}", flush=True)
+    with Children(node_environment(domain), folder) as children:
+        for name, parameters in nodes.items():
+            children.start(name, node_command(name, parameters))
+        while not asked and any(p.poll() is None for p in children.running.values()):
+            for name, process in children.running.items():
+                if process.poll() not in (None, 0):
+                    print(f"pred_bringup: {name} ended: {children.last_line(name)}", file=sys.stderr)
+                    return int(process.returncode)
+            time.sleep(0.1)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,171 @@
+"""A small world for node tests: one predictor or evaluator in this process, publishers that feed it, diagnostics."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+import torch
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseArray
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import UInt8MultiArray
+
+from pred_core.bag.clouds import PointFrame
+from pred_core.bag.grippers import PoseFrame
+from pred_core.springmass.topology import build_body
+from pred_core.twin import Twin, TwinMeta
+from pred_core.types import Grip, Physics, Scene, State
+from pred_ros import convert, qos
+from pred_ros.processes import free_domain
+from pred_ros.shell import Shell
+
+PERIOD = 0.01  # [s]
+COUNT = 5  # particles on a line, 5 cm apart, the first one held
+STEP = 10_000_000  # [ns]
+START = 7_000_000_000  # [ns]
+
+
+class Straight:
+    """A Dynamics with a hand-worked result: free particles fly straight on, held ones follow their gripper."""
+
+    period = PERIOD
+
+    def __init__(self, diverges_after: int = 10**9):
+        self.left = diverges_after
+
+    def start(self, state: State, grip: Grip | None = None) -> State:
+        """Nothing to remember."""
+        return state
+
+    def step(self, state: State, grip: Grip) -> State:
+        """x + v dt; held: the gripper's place."""
+        self.left -= 1
+        position = state.position + state.velocity * PERIOD
+        held = state.held >= 0
+        position[held] = grip.position[state.held[held].long()]
+        if self.left < 0:
+            position = position * torch.nan
+        return state.replace(position=position)
+
+    def rollout(self, state: State, grips: Grip) -> torch.Tensor:
+        """Step by step."""
+        raise NotImplementedError("the predictor steps")
+
+
+def make_twin(folder: Path) -> Path:
+    """A twin of five particles, ids 0 to 4, on disk."""
+    rest = np.zeros((COUNT, 3))
+    rest[:, 0] = 0.05 * np.arange(COUNT)
+    physics = Physics(stiffness=100.0, damping=0.05, connection_threshold=0.06, max_springs=4)
+    body = build_body("line", rest, 0.05, physics, id=np.arange(COUNT, dtype=np.uint32))
+    Twin(TwinMeta(period=PERIOD), body, physics, Scene()).save(folder)
+    return folder
+
+
+def points(frame: int, ids: int = COUNT) -> PointFrame:
+    """Frame k: the line moves along x with 0.5 m/s."""
+    position = np.zeros((ids, 3))
+    position[:, 0] = 0.05 * np.arange(ids) + 0.5 * PERIOD * frame
+    identity = np.arange(ids, dtype=np.uint32)
+    return PointFrame(START + frame * STEP, position, identity, np.ones(ids, np.float32), None)
+
+
+def pose(frame: int) -> PoseFrame:
+    """The gripper holds particle 0."""
+    return PoseFrame(START + frame * STEP, points(frame).position[:1], np.array([[1.0, 0.0, 0.0, 0.0]]))
+
+
+CLOSED = np.array([True])
+
+
+class Bench:
+    """One node under test and what surrounds it, spun together."""
+
+    def __init__(self, node: Shell):
+        self.node = node
+        self.world = rclpy.create_node("bench")
+        complete = qos.points_complete()
+        self.points_out = self.world.create_publisher(PointCloud2, "tracker/points", complete)
+        self.pose_out = self.world.create_publisher(PoseArray, "gripper/pose", complete)
+        self.closed_out = self.world.create_publisher(UInt8MultiArray, "gripper/closed", complete)
+        self.prediction_out = self.world.create_publisher(PointCloud2, "prediction/points", complete)
+        self.predictions: list[tuple[int, State]] = []
+        self.statuses: list[DiagnosticStatus] = []
+        if node.get_name() == "predictor":
+            self.world.create_subscription(PointCloud2, "prediction/points", self._on_prediction, complete)
+        self.world.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(node)
+        self.executor.add_node(self.world)
+
+    def feed(self, frame: int) -> None:
+        """Points, pose and flags of one frame."""
+        self.closed_out.publish(convert.closed_to_message(CLOSED))
+        self.pose_out.publish(convert.pose_to_message(pose(frame)))
+        self.points_out.publish(convert.points_to_cloud(points(frame)))
+
+    def until(self, condition: Callable[[], Any], what: str, limit: float = 8.0) -> None:
+        """Spin until the condition holds; fail after `limit` [s]."""
+        end = time.monotonic() + limit
+        while not condition():
+            assert time.monotonic() < end, f"not within {limit} s: {what}; node says {self.node.diagnostics.message}"
+            self.executor.spin_once(timeout_sec=0.01)
+
+    def says(self, level: bytes, *words: str) -> bool:
+        """True once /diagnostics carried this level with all of the words."""
+        return any(s.level == level and all(w in s.message for w in words) for s in self.statuses)
+
+    def _on_prediction(self, message: PointCloud2) -> None:
+        stamp, _, state = convert.cloud_to_state(message, "prediction/points")
+        self.predictions.append((stamp, state))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self.statuses += [s for s in message.status if s.name.endswith(self.node.get_name())]
+
+
+@contextmanager
+def own_domain() -> Iterator[None]:
+    """A ROS domain of this test, on this machine only."""
+    before = {k: os.environ.get(k) for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
+    os.environ.update(ROS_DOMAIN_ID=str(free_domain()), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
+    try:
+        yield
+    finally:
+        for key, value in before.items():
+            if value is None:
+                os.environ.pop(key)
+            else:
+                os.environ[key] = value
+
+
+@contextmanager
+def bench_of(node_class: type[Shell], parameters: dict[str, str], feeds: bool = True) -> Iterator[Bench]:
+    """A node of a class, configured and active, in a domain of its own; `feeds`: wait until it listens."""
+    arguments = ["--ros-args"]
+    for name, value in parameters.items():
+        arguments += ["-p", f"{name}:={value}"]
+    with own_domain():
+        rclpy.init(args=arguments)
+        node = None
+        try:
+            node = node_class()
+            bench = Bench(node)
+            node.trigger_configure()
+            node.trigger_activate()
+            if feeds:
+                bench.until(lambda: bench.points_out.get_subscription_count() >= 1, "the node listens")
+            yield bench
+        finally:
+            if node is not None:
+                node.stop()
+                bench.executor.shutdown()
+                node.destroy_node()
+            rclpy.try_shutdown()

@@ -1,0 +1,238 @@
+"""The evaluator node, the player's start-up and the shell they share: scores and answers to bad input."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("rclpy", reason="ROS is not installed")
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from rcl_interfaces.msg import Parameter as ParameterMsg
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
+from ros_bench import COUNT, START, STEP, Bench, bench_of, make_twin, own_domain, points
+from std_msgs.msg import String
+
+from pred_core.config import load_yaml
+from pred_core.types import State
+from pred_ros import bringup, convert, marks, qos, shell
+from pred_ros.evaluator_node import EvaluatorNode
+from pred_ros.player_node import PlayerNode
+from pred_ros.predictor_node import PredictorNode
+
+ROOT = Path(__file__).parents[1]
+ERROR = DiagnosticStatus.ERROR
+IDS = np.arange(COUNT, dtype=np.uint32)
+
+
+def prediction(frame: int, off: float = 0.0) -> tuple[int, State]:
+    """The measured place of frame k, moved by `off` [m] along y."""
+    position = torch.as_tensor(points(frame).position, dtype=torch.float32)
+    position[:, 1] += off
+    return START + frame * STEP, State(position, torch.zeros(COUNT, 3), torch.full((COUNT,), -1, dtype=torch.int32))
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with bench_of(EvaluatorNode, {"out": str(tmp_path / "out"), "patience": "0.5"}) as made:
+        yield made
+
+
+def publish(bench: Bench, frames: int, skip: int | None = None) -> None:
+    """`frames` measured frames and predictions 3 mm off from frame 2 on, without the one of frame `skip`."""
+    for k in range(frames):
+        bench.points_out.publish(convert.points_to_cloud(points(k)))
+        if k >= 2 and k != skip:
+            stamp, state = prediction(k, 0.003)
+            bench.prediction_out.publish(convert.state_to_cloud(stamp, IDS, state))
+
+
+def mark_out(bench: Bench, *these: marks.Mark) -> None:
+    """Episode marks, after the data they describe: readers must not depend on the order."""
+    publisher = bench.world.create_publisher(String, marks.TOPIC, qos.latched(10))
+    bench.until(lambda: publisher.get_subscription_count() == 1, "the evaluator listens to marks")
+    for mark in these:
+        publisher.publish(String(data=marks.encode(mark)))
+
+
+def test_score_is_the_distance_put_in(bench: Bench, tmp_path: Path) -> None:
+    publish(bench, 12)
+    mark_out(bench, marks.EpisodeMark("one", 0, 1, START, 12, split="test"), marks.EndMark(1))
+    bench.until(lambda: bench.node.exit_code is not None, "the score is written")
+    assert bench.node.exit_code == 0
+    written = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    metrics = written["entries"][0]["metrics"]
+    # 3 mm along one of three coordinates: mde 3 mm, coordinate_l1 1 mm; float32 on the wire.
+    assert metrics["mde"]["all_steps"]["mean"] == pytest.approx(0.003, abs=1e-7)
+    assert metrics["coordinate_l1"]["all_steps"]["mean"] == pytest.approx(0.001, abs=1e-7)
+    assert written["frames"] == {"announced": 12, "lost": 0}
+    assert "Live prediction, scored" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_lost_prediction_is_counted_and_not_averaged(bench: Bench, tmp_path: Path) -> None:
+    publish(bench, 12, skip=7)
+    mark_out(bench, marks.EpisodeMark("one", 0, 1, START, 12), marks.EndMark(1))
+    bench.until(lambda: bench.node.exit_code is not None, "the score is written after `patience`")
+    written = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert written["frames"] == {"announced": 12, "lost": 1}
+    assert written["entries"][0]["metrics"]["mde"]["all_steps"]["mean"] == pytest.approx(0.003, abs=1e-7)
+
+
+def test_two_episodes_are_cut_at_the_marks(bench: Bench, tmp_path: Path) -> None:
+    publish(bench, 20)
+    first = marks.EpisodeMark("a", 0, 2, START, 10, split="test")
+    second = marks.EpisodeMark("b", 1, 2, START + 10 * STEP, 10, split="test")
+    mark_out(bench, second, first, marks.EndMark(2))
+    bench.until(lambda: bench.node.exit_code is not None, "the score is written")
+    written = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert set(written["entries"][0]["metrics"]["mde"]["all_steps"]["per_episode"]) == {"a", "b"}
+
+
+def test_nothing_predicted_is_an_error(bench: Bench, capsys: pytest.CaptureFixture) -> None:
+    for k in range(5):
+        bench.points_out.publish(convert.points_to_cloud(points(k)))
+    mark_out(bench, marks.EpisodeMark("one", 0, 1, START, 5), marks.EndMark(1))
+    bench.until(lambda: bench.node.exit_code is not None, "the evaluator gives up")
+    assert bench.node.exit_code == 2
+    assert "no prediction matches a measured frame" in capsys.readouterr().err
+
+
+def test_bad_messages_are_refused_by_name(bench: Bench) -> None:
+    stamp, state = prediction(3)
+    cloud = convert.state_to_cloud(stamp, IDS, state)
+    cloud.header.frame_id = "base_link"
+    bench.prediction_out.publish(cloud)
+    bench.until(lambda: bench.says(ERROR, "prediction/points", "base_link"), "an error about the frame")
+    bad = points(0)
+    bad.position[0] = np.inf
+    bench.points_out.publish(convert.points_to_cloud(bad))
+    bench.until(lambda: bench.says(ERROR, "ids 0 are not finite"), "an error about the points")
+    for k in (5, 4):
+        bench.points_out.publish(convert.points_to_cloud(points(k)))
+    bench.until(lambda: bench.says(ERROR, "tracker/points: time runs backwards"), "an error about the time")
+    mark = bench.world.create_publisher(String, marks.TOPIC, qos.latched(10))
+    mark.publish(String(data="{}"))
+    bench.until(lambda: bench.says(ERROR, "player/episode: event"), "an error about the mark")
+
+
+def test_a_state_that_is_not_finite_never_becomes_a_message() -> None:
+    stamp, state = prediction(3)
+    with pytest.raises(ValueError, match="not finite"):
+        convert.state_to_cloud(stamp, IDS, state.replace(position=state.position * torch.nan))
+
+
+def test_clouds_survive_the_wire_bit_for_bit() -> None:
+    stamp, state = prediction(5, 0.0012345)
+    back_stamp, ids, back = convert.cloud_to_state(convert.state_to_cloud(stamp, IDS, state), "state/points")
+    assert back_stamp == stamp and ids.tolist() == IDS.tolist()
+    assert torch.equal(back.position, state.position) and torch.equal(back.held, state.held)
+    frame = points(3)
+    again = convert.cloud_to_points(convert.points_to_cloud(frame))
+    assert np.array_equal(again.position, frame.position.astype(np.float32)) and again.stamp == frame.stamp
+
+
+def run_node(node: type[shell.Shell], *parameters: str) -> int:
+    """A node's main with parameters NAME:=VALUE."""
+    arguments = ["--ros-args"]
+    for parameter in parameters:
+        arguments += ["-p", parameter]
+    with own_domain():
+        return shell.run(node, arguments)
+
+
+STARTS = [
+    (PlayerNode, (), "parameter 'bag' is empty"),
+    (PlayerNode, ("bag:=/no/such/bag.mcap",), "no such bag"),
+    (PlayerNode, (f"bag:={ROOT / 'LICENSE'}",), "not a bag"),
+    (PlayerNode, (f"bag:={ROOT / 'bags/sample_cable'}", "episodes:=ep999"), "no episode 'ep999'"),
+    (PlayerNode, (f"bag:={ROOT / 'bags/sample_cable'}", "factor:=0.0"), "factor; got 0.0 x real time; allowed: 0.01"),
+    (PlayerNode, (f"bag:={ROOT / 'bags/sample_cable'}", "factr:=2.0"), "unknown key 'factr'. did you mean 'factor'?"),
+    (PlayerNode, (f"bag:={ROOT / 'bags/sample_cable'}", "stamps:=now", "factor:=2.0"), "factor 1"),
+    (PlayerNode, (f"bag:={ROOT / 'bags/sample_cable'}", "patience:=0.2"), "no reader within 0.2 s"),
+    (PredictorNode, (), "parameter 'twin' is empty"),
+    (PredictorNode, ("twin:=/no/such/twin",), "/no/such/twin"),
+    (PredictorNode, ("twin:=x", "horizon:=9.0"), "horizon; got 9.0 s; allowed: 0.0 to 5.0 s"),
+    (PredictorNode, ("twin:=x", "correct:=sometimes"), "allowed: none, tracks"),
+    (PredictorNode, ("twin:=x", "threads:=1.5"), "threads; got 1.5 (float); allowed: int"),
+    (EvaluatorNode, ("tolerance:=-1.0",), "tolerance; got -1.0 s"),
+    (EvaluatorNode, ("out:=/proc/nowhere",), "the folder cannot be made"),
+]
+
+
+@pytest.mark.parametrize(("node", "parameters", "expected"), STARTS)
+def test_a_bad_start_is_one_clear_line_and_code_2(
+    node: type[shell.Shell], parameters: tuple[str, ...], expected: str, capfd: pytest.CaptureFixture
+) -> None:
+    assert run_node(node, *parameters) == 2
+    lines = [x for x in capfd.readouterr().err.splitlines() if x.startswith(f"{node.NAME}: ")]
+    assert len(lines) == 1 and expected.lower() in lines[0].lower()
+
+
+def test_held_that_does_not_fit_the_twin_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
+    twin = make_twin(tmp_path / "twin")
+    assert run_node(PredictorNode, f"twin:={twin}", "held:='77:0'") == 2
+    assert "particles the twin does not have; got [77]" in capfd.readouterr().err
+    assert run_node(PredictorNode, f"twin:={twin}", "held:='zero'") == 2
+    assert "pairs like '0:0 1:1 11:2'" in capfd.readouterr().err
+
+
+def test_parameters_change_all_or_none(bench: Bench) -> None:
+    client = bench.world.create_client(SetParametersAtomically, "/evaluator/set_parameters_atomically")
+    bench.until(client.service_is_ready, "the service")
+
+    def value(name: str, number: float) -> ParameterMsg:
+        return ParameterMsg(name=name, value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=number))
+
+    request = SetParametersAtomically.Request(parameters=[value("patience", 3.0), value("tolerance", 5.0)])
+    answer = client.call_async(request)
+    bench.until(answer.done, "an answer")
+    assert not answer.result().result.successful
+    assert bench.node.config.patience == 0.5
+    request = SetParametersAtomically.Request(parameters=[value("patience", 3.0), value("tolerance", 0.5)])
+    answer = client.call_async(request)
+    bench.until(answer.done, "an answer")
+    assert answer.result().result.successful
+    assert (bench.node.config.patience, bench.node.config.tolerance) == (3.0, 0.5)
+
+
+def test_descriptors_carry_unit_and_range(bench: Bench) -> None:
+    client = bench.world.create_client(DescribeParameters, "/evaluator/describe_parameters")
+    bench.until(client.service_is_ready, "the service")
+    answer = client.call_async(DescribeParameters.Request(names=["patience"]))
+    bench.until(answer.done, "an answer")
+    descriptor = answer.result().descriptors[0]
+    assert "[s]" in descriptor.description
+    bounds = descriptor.floating_point_range[0]
+    assert (bounds.from_value, bounds.to_value) == (0.1, 600.0)
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "config" / "nodes").glob("*.yaml")), ids=lambda p: p.name)
+def test_shipped_parameter_files_fit_the_nodes(file: Path) -> None:
+    classes = {c.NAME: c.CONFIG for c in (PlayerNode, PredictorNode, EvaluatorNode)}
+    from pred_core.config import from_mapping
+
+    for name, parameters in bringup.read_nodes(file).items():
+        from_mapping(classes[name], parameters, f"{file.name}: {name}")
+    assert load_yaml(file)
+
+
+def test_bringup_refuses_unknown_nodes_and_malformed_overrides(tmp_path: Path) -> None:
+    file = tmp_path / "nodes.yaml"
+    file.write_text("predicter:\n  ros__parameters: {}\n")
+    with pytest.raises(ValueError, match="did you mean 'predictor'"):
+        bringup.read_nodes(file)
+    file.write_text("predictor:\n  ros__parameters: {twin: x}\n")
+    with pytest.raises(ValueError, match="NODE.PARAMETER=VALUE"):
+        bringup.read_nodes(file, ["player.bag=y"])
+    assert bringup.read_nodes(file, ["predictor.horizon=0.5"])["predictor"] == {"twin": "x", "horizon": 0.5}
+
+
+def test_nothing_of_a_test_stays_initialised() -> None:
+    assert not rclpy.ok()
