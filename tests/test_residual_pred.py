@@ -12,7 +12,7 @@ from pred_core.dynamics import Dynamics
 from pred_core.errors import DivergenceError, InputError
 from pred_core.pred import FRAME, PReD, with_residual
 from pred_core.residual import ResidualConfig, build_network
-from pred_core.types import State, stack_states
+from pred_core.types import Grip, State, stack_states
 
 SMALL = ResidualConfig(feature=16, hidden=16, embedding=16, feedforward=32, encoder_feedforward=32, encoder_layers=2)
 
@@ -126,3 +126,15 @@ def test_twin_without_residual_stays_the_base() -> None:
     state = random_state(torch.Generator().manual_seed(0))
     expected = model().step(model().start(state, still_grip()), still_grip())
     assert loaded.step(loaded.start(state, still_grip()), still_grip()).position.equal(expected.position)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+def test_cuda_equals_cpu() -> None:
+    cpu, gpu = model(), PReD(Falling(), model().network.cuda(), line_body())
+    start = random_state(torch.Generator().manual_seed(0), 3)
+    state, grip = cpu.start(start, still_grip(3)), still_grip(3)
+    there = Grip(grip.position.cuda(), grip.rotation.cuda(), grip.closed.cuda())
+    other = gpu.start(State(start.position.cuda(), start.velocity.cuda(), start.held.cuda()), there)
+    for _ in range(7):
+        state, other = cpu.step(state, grip), gpu.step(other, there)
+    assert torch.allclose(state.position, other.position.cpu(), atol=1e-4)  # float32 sums in another order

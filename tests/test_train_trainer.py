@@ -81,9 +81,10 @@ def test_same_seed_same_run_other_seed_other_run() -> None:
     assert not same(everything(runs[0]), everything(runs[2]))
 
 
-@pytest.mark.parametrize("stop_at", [1, 3, 5])
-def test_resumed_run_equals_the_uninterrupted_one_bit_for_bit(stop_at: int, tmp_path: Path) -> None:
-    whole, first, second = trainer(), trainer(), trainer()
+@pytest.mark.parametrize(("stop_at", "carry"), [(1, 1), (3, 1), (5, 1), (5, 3)])
+def test_resumed_run_equals_the_uninterrupted_one_bit_for_bit(stop_at: int, carry: int, tmp_path: Path) -> None:
+    config = dataclasses.replace(QUICK, carry=carry, noise_velocity=0.01)
+    whole, first, second = trainer(config), trainer(config), trainer(config)
     while not whole.done:
         whole.advance()
     path = tmp_path / "checkpoint.safetensors"
@@ -138,7 +139,7 @@ def test_every_window_once_an_epoch() -> None:
     run = trainer(dataclasses.replace(QUICK, batch=5))
     windows = len(run.index)
     assert windows == 3 * 10  # 3 fitted recordings of 14 frames, starts 1..10 leave 3 periods
-    seen = torch.cat([run._draw() for _ in range(windows // 5)])
+    seen = torch.cat([run._draw(5) for _ in range(windows // 5)])
     assert len(seen.unique(dim=0)) == windows
 
 
@@ -149,6 +150,21 @@ def test_kept_weights_are_those_of_the_best_held_out_step() -> None:
     best = run.curves.held_out_step[run.curves.held_out_mm.index(min(run.curves.held_out_mm))]
     assert run.best_step == best
     assert same(run.chosen().state_dict(), run.best)
+
+
+def test_carried_windows_follow_each_other_on_own_predictions() -> None:
+    # 14 frames, start at frame 1, windows of 3: frames 1-4, 4-7, 7-10, then the carry of 3 is used up.
+    run = trainer(dataclasses.replace(QUICK, carry=3, steps=20, azimuth=False))
+    assert run.index[:, 1].eq(1).all() and len(run.index) == 3
+    seen = []
+    for _ in range(12):
+        run.advance()
+        assert run.slots is not None
+        seen.append(run.slots.place[0, 1].item())
+    first = seen.index(4, 1)  # the first carry was drawn from 1..3
+    assert seen[first : first + 6] == [4, 7, 10, 4, 7, 10]
+    assert set(run.slots.place[:, 1].tolist()) <= {4, 7, 10}
+    assert run.slots.state.memory["residual/count"].min() >= 3  # the window of estimates is carried too
 
 
 def test_azimuth_turns_about_gravity() -> None:

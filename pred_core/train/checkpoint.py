@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from pred_core.errors import TwinError
+from pred_core.train.slots import Slots
 from pred_core.train.trainer import Curves, Trainer
 
 FORMAT = 1
@@ -32,6 +33,8 @@ def save_checkpoint(path: Path, trainer: Trainer, source: dict[str, str]) -> Non
     tensors |= _named("network", trainer.network.state_dict())
     tensors |= _named("average", trainer.average.state_dict())
     tensors |= _named("best", trainer.best)
+    if trainer.slots is not None:
+        tensors |= _named("slots", trainer.slots.tensors())
     for i, state in trainer.optimizer.state_dict()["state"].items():
         tensors |= _named(f"adam.{i}", state)
     facts = {
@@ -97,6 +100,8 @@ def load_checkpoint(path: Path, trainer: Trainer, source: dict[str, str]) -> Non
     numbers = adam["param_groups"][0]["params"]
     states = {i: _part(f"adam.{i}", tensors) for i in numbers}
     trainer.optimizer.load_state_dict({**adam, "state": {i: state for i, state in states.items() if state}})
+    slots = _part("slots", tensors)
+    trainer.slots = Slots.restored(slots, trainer.device) if slots else None
     trainer.step, trainer.cursor, trainer.best_step = facts["step"], facts["cursor"], facts["best_step"]
     trainer.seconds = facts["seconds"]
     trainer.curves = Curves(**facts["curves"])

@@ -24,6 +24,13 @@ class TrainingConfig:
         doc="detached: each step's own error (paper); ballistic: a correction also answers for later steps, "
         "as if the backbone only carried it on at constant velocity",
     )
+    carry: int = setting(
+        1,
+        low=1,
+        high=100_000,
+        doc="windows in a row that go on from the model's own state, from the beginning of a recording; "
+        "1: every window starts from a measurement (paper). Needed for backbones with memory",
+    )
     azimuth: bool = setting(True, doc="show each window to the network at a random azimuth about gravity")
     noise_position: float = setting(0.0, unit="m", low=0.0, high=1.0, doc="standard deviation added to starts")
     noise_velocity: float = setting(0.0, unit="m/s", low=0.0, high=10.0, doc="standard deviation added to starts")

@@ -116,6 +116,13 @@ def window_index(recordings: Sequence[Recording], steps: int, stride: int) -> Te
     return index
 
 
+def beginnings(index: Tensor) -> Tensor:
+    """The first window of each recording in `index` (M, 2)."""
+    recording = index[:, 0]
+    first = torch.cat((torch.ones(1, dtype=torch.bool), recording[1:] != recording[:-1]))
+    return index[first]
+
+
 def gather(recordings: Sequence[Recording], index: Tensor, steps: int, period: float, device: torch.device) -> Batch:
     """The windows `index` (B, 2) as one batch; start velocity by backward difference."""
     starts, grips, before, targets = [], [], [], []

@@ -27,6 +27,7 @@ class Outcome:
     loss: Tensor  # scalar [mm^2] or [mm], with the penalty
     error: float  # [mm] mean absolute error per coordinate
     binding: float  # share of residual components beyond 0.95 of the cap
+    state: State  # after the last step, without gradient
 
 
 def random_azimuth(gravity: Sequence[float], number: int, generator: torch.Generator) -> Tensor:
@@ -48,17 +49,22 @@ def disturbed(start: State, config: TrainingConfig, generator: torch.Generator) 
     return start
 
 
-def training_rollout(
+def training_start(
     model: PReD, batch: Batch, config: TrainingConfig, gravity: Sequence[float], generator: torch.Generator
-) -> Outcome:
-    """Loss over K steps of own predictions: (X_sim + dV dt - X_true)^2, the simulator detached.
+) -> State:
+    """The batch's start as training sees it: with noise and azimuth, if the configuration asks for them."""
+    state = model.start(disturbed(batch.start, config, generator), batch.start_grip)
+    if config.azimuth:
+        turn = random_azimuth(gravity, len(state.position), generator).to(state.position.device)
+        state = state.replace(memory={**state.memory, FRAME: turn})
+    return state
+
+
+def training_rollout(model: PReD, state: State, batch: Batch, config: TrainingConfig) -> Outcome:
+    """Loss over K steps of own predictions from `state`: (X_sim + dV dt - X_true)^2, the simulator detached.
 
     This is the paper's loss on dV dt against X_true - X_sim, in mm.
     """
-    state = model.start(disturbed(batch.start, config, generator), batch.start_grip)
-    if config.azimuth:
-        turn = random_azimuth(gravity, len(batch.seen[0]), generator).to(batch.target.device)
-        state = state.replace(memory={**state.memory, FRAME: turn})
     total, penalty = batch.target.new_zeros(()), batch.target.new_zeros(())
     absolute, binding = batch.target.new_zeros(()), batch.target.new_zeros(())
     count = 3 * batch.seen.sum().clamp_min(1)
@@ -73,7 +79,7 @@ def training_rollout(
         binding += binding_share(step.residual.detach(), step.state.held < 0, model.network.config.cap)
         state = arrived if config.gradient == "ballistic" else _detached(arrived)
     loss = total / count + config.penalty * penalty / steps
-    return Outcome(loss, float(absolute / count), float(binding / steps))
+    return Outcome(loss, float(absolute / count), float(binding / steps), _detached(state))
 
 
 @torch.no_grad()
@@ -89,7 +95,7 @@ def held_out_error(model: PReD, batch: Batch) -> Outcome:
     error = absolute / (3 * batch.seen.sum()).clamp_min(1)
     if not bool(torch.isfinite(error)):
         raise DivergenceError("a held-out rollout left the finite numbers", next_step="Lower --cap or --learning-rate")
-    return Outcome(error, float(error), float(binding / len(batch.target)))
+    return Outcome(error, float(error), float(binding / len(batch.target)), state)
 
 
 def _detached(state: State) -> State:

@@ -17,9 +17,10 @@ from pred_core.errors import DivergenceError
 from pred_core.pred import PReD
 from pred_core.residual import ResidualConfig, ResidualNetwork, build_network
 from pred_core.train.config import TrainingConfig
-from pred_core.train.recordings import Batch, Recording, gather, split_groups, window_index
-from pred_core.train.rollout import held_out_error, training_rollout
-from pred_core.types import STANDARD_GRAVITY, Body
+from pred_core.train.recordings import Batch, Recording, beginnings, gather, split_groups, window_index
+from pred_core.train.rollout import Outcome, held_out_error, training_rollout, training_start
+from pred_core.train.slots import Slots, refill
+from pred_core.types import STANDARD_GRAVITY, Body, State
 
 
 @dataclass
@@ -54,6 +55,9 @@ class Trainer:
         self.shuffle = torch.Generator().manual_seed(config.seed + 1)
         self.fit, held_out = split_groups(recordings, config.holdout, self.generator)
         self.index = window_index(self.fit, config.rollout, config.stride)
+        if config.carry > 1:
+            self.index = beginnings(self.index)
+        self.slots: Slots | None = None
         self.held_out = held_out
         self.held_out_batch = self._held_out_batch(held_out)
         self.network = build_network(network, config.seed).to(self.device)
@@ -77,11 +81,13 @@ class Trainer:
         if self.step == 0 and not self.curves.held_out_step:
             self._evaluate()
         model = PReD(self.base, self.network, self.body, shuffle=self.shuffle)
-        batch = gather(self.fit, self._draw(), self.config.rollout, self.base.period, self.device)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(self.step)
         self.optimizer.zero_grad()
-        outcome = training_rollout(model, batch, self.config, self.gravity, self.generator)
+        try:
+            outcome = self._rollout(model)
+        except DivergenceError as error:
+            raise DivergenceError(f"at training step {self.step + 1}: {error}") from error
         outcome.loss.backward()  # type: ignore[no-untyped-call]
         loss = float(outcome.loss.detach())
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
@@ -99,6 +105,33 @@ class Trainer:
         self.curves.binding.append(outcome.binding)
         if self.step % self.config.evaluate_every == 0 or self.done:
             self._evaluate()
+
+    def _rollout(self, model: PReD) -> Outcome:
+        """One batch of windows: from measurements, or going on where the last ones ended."""
+        steps = self.config.rollout
+        if self.config.carry == 1:
+            batch = self._gather(self._draw(self.config.batch), steps)
+            return training_rollout(model, self._start(model, batch), batch, self.config)
+        self.slots = refill(
+            self.slots,
+            torch.tensor([len(r.position) for r in self.fit]),
+            steps,
+            self.config.carry,
+            self.config.batch,
+            self._draw,
+            lambda places: self._start(model, self._gather(places, 0)),
+            self.generator,
+        )
+        batch = self._gather(self.slots.place, steps)
+        outcome = training_rollout(model, self.slots.state, batch, self.config)
+        self.slots = self.slots.moved(outcome.state, steps)
+        return outcome
+
+    def _start(self, model: PReD, batch: Batch) -> State:
+        return training_start(model, batch, self.config, self.gravity, self.generator)
+
+    def _gather(self, places: Tensor, steps: int) -> Batch:
+        return gather(self.fit, places, steps, self.base.period, self.device)
 
     def learning_rate(self, step: int) -> float:
         """Cosine from the configured rate to zero over the run."""
@@ -133,14 +166,14 @@ class Trainer:
         index = window_index(recordings, max(steps, 1), stride=max(steps, 1))
         return gather(recordings, index, max(steps, 1), self.base.period, self.device)
 
-    def _draw(self) -> Tensor:
-        """(B, 2) the next windows; every window once an epoch, in an order drawn anew for each."""
+    def _draw(self, number: int) -> Tensor:
+        """(number, 2) recording and start frame of the next windows; each once an epoch, in a new order."""
         drawn: list[int] = []
-        while len(drawn) < self.config.batch:
+        while len(drawn) < number:
             if self.cursor >= len(self.order):
                 self.order = torch.randperm(len(self.index), generator=self.generator)
                 self.cursor = 0
-            take = self.order[self.cursor : self.cursor + self.config.batch - len(drawn)]
+            take = self.order[self.cursor : self.cursor + number - len(drawn)]
             self.cursor += len(take)
             drawn += take.tolist()
         return self.index[drawn]
