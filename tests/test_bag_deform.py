@@ -36,7 +36,6 @@ def _npz(path: Path, **changes: object) -> Path:
         "hz": np.float32(100.0),
         "split": np.array(["train", "train", "train", "eval"]),
         "recording_id": np.array([0, 0, 1, 1]),
-        "source_file": np.array([f"{i}.pkl" for i in range(4)]),
         **changes,
     }
     np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
@@ -79,6 +78,7 @@ def test_pickles_give_the_same_episodes_and_find_the_recordings(tmp_path: Path) 
         assert np.array_equal(a, b)
     assert from_pickles.split == from_npz.split
     assert from_pickles.recording == (0, 0, 1, 1)
+    assert read_deform(_npz(tmp_path / "unnamed.npz", recording_id=None)).recording == (0, 0, 1, 1)
 
 
 def test_an_interrupted_conversion_goes_on(tmp_path: Path) -> None:
@@ -172,9 +172,10 @@ def test_bytes_that_are_no_pickle(tmp_path: Path, content: bytes) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"recording_id": None}, "not DEFORM data, no recording_id"),
+        ({"split": None}, "not DEFORM data, no split"),
         ({"hz": np.float32(50.0)}, "hz; got 50.0; allowed: 100.0"),
         ({"positions": np.zeros((4, 30, 7, 2), np.float32)}, "positions; got"),
+        ({"positions": np.zeros((4, 1, 7, 3), np.float32)}, "2 frames or more"),
         ({"split": np.array(["train", "train", "train", "maybe"])}, "unknown split; got 'maybe'"),
         ({"positions": np.full((4, 30, 7, 3), np.nan, np.float32)}, "not finite"),
         ({"positions": 1000.0 * _positions()}, "are these millimetres"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,7 +39,7 @@ class DeformSource:
     position: tuple[NDArray[np.float64], ...]  # each (T, V, 3) [m] world
     split: tuple[str, ...]
     recording: tuple[int, ...]
-    origin: tuple[str, ...]  # file names in the repository
+    origin: tuple[str, ...]  # what an error calls each episode
     digest: str  # identifies the source
 
     @property
@@ -115,7 +116,7 @@ def deform_episode(source: DeformSource, index: int) -> Episode:
 
 
 def group_recordings(position: tuple[NDArray[np.float64], ...]) -> tuple[int, ...]:
-    """Recording index of each episode, found from the motion: the pickles do not name it.
+    """Recording index of each episode, found from the motion, where the source (the pickles) does not name it.
 
     Episodes are adjacent windows of longer recordings: the next one begins where this one, moved on by one
     frame, ends. On both published cables adjacent windows meet within 6.5 mm and no others within 42 mm.
@@ -168,32 +169,34 @@ def claim_folder(root: Path, source: dict[str, object]) -> None:
 
 
 def _read_npz(path: Path) -> DeformSource:
-    wanted = ("positions", "split", "recording_id", "source_file", "hz")
+    wanted = ("positions", "split", "hz")
     try:
         with np.load(path, allow_pickle=False) as data:
             missing = [k for k in wanted if k not in data.files]
             if missing:
                 raise DatasetError(f"{path}: not DEFORM data, no {', '.join(missing)}", got=", ".join(data.files))
             positions, hz = data["positions"], float(data["hz"])
-            splits, recordings = data["split"].tolist(), data["recording_id"].tolist()
-            origin = data["source_file"].tolist()
-    except (OSError, EOFError, ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+            splits = data["split"].tolist()
+            recordings = data["recording_id"].tolist() if "recording_id" in data.files else None
+    except (OSError, EOFError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
         if isinstance(error, DatasetError):
             raise
         raise DatasetError(f"{path}: not an npz file", got=error, next_step="Give the npz or its folder") from error
-    if positions.ndim != 4 or positions.shape[-1] != 3 or positions.dtype.kind != "f" or not len(positions):
-        raise DatasetError(f"{path}: positions", got=positions.shape, allowed="(episode, frame, vertex, 3) floats")
+    shape = positions.shape
+    if positions.dtype.kind != "f" or len(shape) != 4 or shape[-1] != 3 or shape[0] < 1 or shape[1] < 2:
+        raise DatasetError(f"{path}: positions", got=shape, allowed="(episode, 2 frames or more, vertex, 3) floats")
     if hz != RATE:
         raise DatasetError(f"{path}: hz", got=hz, allowed=RATE)
-    lengths = {len(positions), len(splits), len(recordings), len(origin)}
+    lengths = {len(positions), len(splits), len(positions if recordings is None else recordings)}
     if len(lengths) != 1:
         raise DatasetError(f"{path}: arrays of different lengths", got=sorted(lengths))
+    position = tuple(positions.astype(np.float64))
     return DeformSource(
         name=path.stem,
-        position=tuple(positions.astype(np.float64)),
+        position=position,
         split=tuple(_split(s, path) for s in splits),
-        recording=tuple(int(r) for r in recordings),
-        origin=tuple(origin),
+        recording=group_recordings(position) if recordings is None else tuple(int(r) for r in recordings),
+        origin=tuple(f"episode {i}" for i in range(len(position))),
         digest=file_sha256(path),
     )
 
