@@ -274,5 +274,5 @@ def _unflatten(state: State, lead: torch.Size) -> State:
         state.position.reshape(*lead, *state.position.shape[1:]),
         state.velocity.reshape(*lead, *state.velocity.shape[1:]),
         state.held.reshape(*lead, *state.held.shape[1:]),
-        {k: v.reshape(*lead, *v.shape[1:]) for k, v in state.memory.items()},
+        {k: v.reshape((*lead, *v.shape[1:])) for k, v in state.memory.items()},
     )
