@@ -20,7 +20,7 @@ from pred_core.evaluate.models import Model
 from pred_core.evaluate.protocol import diverged_at, predict
 from pred_core.evaluate.scores import score_episode, statistics
 from pred_core.evaluate.splits import Fold, Split, grouped, published
-from pred_core.evaluate.where import error_map, error_spectrum
+from pred_core.evaluate.where import error_by_speed, error_map, error_spectrum
 from pred_core.report import Page, Track, animation
 from pred_core.springmass.topology import build_body
 from pred_core.twin import Twin, TwinMeta
@@ -147,6 +147,17 @@ def test_error_spectrum_finds_the_frequency_of_a_sine():
     frequency, share = error_spectrum([prediction], [episode_of(cable, [0, -1, 1])])
     assert share[frequency < 4.5].max() == pytest.approx(0.0, abs=1e-12)
     assert share[np.isclose(frequency, 5.0)] == pytest.approx(1.0)
+
+
+def test_error_by_speed_puts_the_error_where_the_gripper_is_fast():
+    # The left end stands for 20 frames, then moves at 1 m/s; particle 1 of 5 is 15 mm off along z while it moves.
+    cable = moved_cable(0.0, frames=42).position
+    cable[22:, 0, 0] = 0.01 * np.arange(1, 21)
+    prediction = cable[2:].copy()
+    prediction[20:, 1, 2] += 0.015
+    speed, error = error_by_speed([prediction], [episode_of(cable, [0, -1, -1, -1, -1])], bins=2)
+    assert speed.tolist() == pytest.approx([0.0, 1.0])
+    assert error.tolist() == pytest.approx([0.0, 1e-3])
 
 
 @pytest.fixture(scope="module")

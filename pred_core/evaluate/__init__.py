@@ -1,0 +1,1 @@
+"""Scores of models on measured episodes: protocol, splits, statistics, figures and the report."""

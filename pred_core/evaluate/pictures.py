@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from pred_core.evaluate.evaluation import Result
 from pred_core.evaluate.protocol import FIRST_PREDICTED
 from pred_core.evaluate.style import GREY, INK, styles, tidy
-from pred_core.evaluate.where import error_map, error_spectrum
+from pred_core.evaluate.where import error_by_speed, error_map, error_spectrum
 from pred_core.types import Array
 
 CM = 100.0  # [cm/m]
@@ -77,9 +77,9 @@ def error_by_episode(results: Sequence[Result], main: Result) -> Figure:
 
 
 def error_on_object(results: Sequence[Result]) -> Figure:
-    """Per particle and direction: mean absolute error, mean signed error, and the spectrum of the error."""
-    figure = Figure(figsize=(10, 2.9 * len(results)), layout="constrained")
-    grid = figure.subplots(len(results), 3, squeeze=False, gridspec_kw={"width_ratios": (1, 1, 0.8)})
+    """Per particle and direction: mean absolute and signed error; the spectrum of the error; error against speed."""
+    figure = Figure(figsize=(12, 2.9 * len(results)), layout="constrained")
+    grid = figure.subplots(len(results), 4, squeeze=False, gridspec_kw={"width_ratios": (1, 1, 0.75, 0.75)})
     for row, result in zip(grid, results, strict=True):
         predictions, episodes = usable(result)
         where = error_map(predictions, episodes)
@@ -94,11 +94,16 @@ def error_on_object(results: Sequence[Result]) -> Figure:
         row[2].step(frequency, 100 * share, where="post", color=INK)
         row[2].set_xlim(0, 6)
         row[2].set_ylim(0, 103)
+        speed, error = error_by_speed(predictions, episodes)
+        row[3].plot(speed, error * CM, color=INK, marker="o", markersize=3.5)
+        row[3].set_ylim(bottom=0)
+        row[3].set_xlim(left=0)
         row[0].set_ylim(bottom=0)
         row[0].set_title(result.model.name, loc="left", fontsize=11, fontweight="bold", color=INK)
         tidy(row[0], "particle id", "mean |error| [cm]")
         tidy(row[1], "particle id", "mean signed error [cm]")
-        tidy(row[2], "frequency [Hz]", "share of squared error below [%]")
+        tidy(row[2], "frequency [Hz]", "squared error below [%]")
+        tidy(row[3], "speed of the held particles [m/s]", "error per coordinate [cm]")
     grid[0, 0].legend(frameon=False, fontsize=8)
     return figure
 

@@ -191,7 +191,7 @@ def _figures(page: Page, results: Sequence[Result], folder: Path, split: str) ->
         "error_on_object": (
             pictures.error_on_object([main, *compared]),
             "Where the error sits, per particle and direction (the plane is the vertical one through the held ends), "
-            "and below which frequency.",
+            "below which frequency, and at which speed of the grippers.",
         ),
         "worst_episode": (pictures.shapes(main, worst, _having(compared, worst)), f"Worst episode, {worst}."),
         "median_episode": (pictures.shapes(main, median, _having(compared, median)), f"Median episode, {median}."),

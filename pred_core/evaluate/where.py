@@ -1,4 +1,4 @@
-"""Where the error sits: per particle and direction, and at which frequencies."""
+"""Where the error sits: per particle and direction, at which frequencies, at which speed of the grippers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pred_core.evaluate.protocol import FIRST_PREDICTED
-from pred_core.metrics import scored
+from pred_core.metrics import coordinate_l1, scored
 from pred_core.types import Array, Episode
 
 DIRECTIONS = ("along", "vertical", "out of plane")
@@ -71,6 +71,27 @@ def error_spectrum(predictions: Sequence[Array], episodes: Sequence[Episode]) ->
     total = power.sum()
     share = np.cumsum(power) / total if total > 0 else np.ones_like(power)
     return np.asarray(np.fft.rfftfreq(common, period), dtype=np.float64), np.asarray(share)
+
+
+def error_by_speed(predictions: Sequence[Array], episodes: Sequence[Episode], bins: int = 8) -> tuple[Array, Array]:
+    """Mean error per coordinate against the mean speed of the held particles: (B,) [m/s], (B,) [m].
+
+    Bins hold equally many frames. Without held particles, the speed of the object's mean position.
+    """
+    speeds, errors = [], []
+    for prediction, episode in zip(predictions, episodes, strict=True):
+        measured = episode.position[FIRST_PREDICTED:]
+        errors.append(coordinate_l1(prediction, measured, episode.tracks.visible[FIRST_PREDICTED:]))
+        held = episode.held >= 0
+        followed = episode.position[:, held if held.any() else slice(None)]
+        moved = np.diff(followed, axis=0)[FIRST_PREDICTED - 1 :]
+        moved = moved if held.any() else moved.mean(axis=1, keepdims=True)
+        speeds.append(np.linalg.norm(moved, axis=-1).mean(axis=1) / episode.period)
+    speed, error = np.concatenate(speeds), np.concatenate(errors)
+    usable = np.isfinite(speed) & np.isfinite(error)
+    order = np.argsort(speed[usable], kind="stable")
+    parts = [p for p in np.array_split(order, bins) if len(p)]
+    return np.array([speed[usable][p].mean() for p in parts]), np.array([error[usable][p].mean() for p in parts])
 
 
 def _plane(measured: Array, episode: Episode) -> tuple[Array, NDArray[np.bool_]]:
