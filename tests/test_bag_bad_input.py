@@ -98,6 +98,16 @@ def test_unknown_field_layout(tmp_path: Path, edit, words: str) -> None:
     assert "x f4, y f4, z f4, id u4" in str(caught.value)
 
 
+def test_a_point_of_gigabytes(tmp_path: Path) -> None:
+    def edit(topic, message, number):
+        if topic == TRACKER_POINTS:
+            message.point_step, message.width, message.data = 2**31, 0, message.data[:0]
+        return message
+
+    with pytest.raises(BagError, match="unknown field layout, point_step 2147483648 is larger than 65536"):
+        read_episode(edited_bag(tmp_path / "a.mcap", edit))
+
+
 def test_points_that_do_not_fit_their_bytes(tmp_path: Path) -> None:
     def edit(topic, message, number):
         if topic == TRACKER_POINTS:

@@ -30,6 +30,7 @@ _OPTIONAL = {"confidence": ("f4",), "rgb": ("u4", "f4")}  # PCL writes the packe
 
 LARGEST_EXTENT = 10.0  # [m] of one cloud; a larger one is millimetres written as metres
 LARGEST_COORDINATE = 100.0  # [m] from the world origin
+LARGEST_POINT = 1 << 16  # [bytes]
 _MAX_DAMAGE_LISTED = 5
 
 
@@ -80,6 +81,8 @@ def _layout(
     kinds = {name: (_DTYPES.get(datatype), count) for name, _, datatype, count in fields}
     if len(kinds) != len(fields):
         return "a field is named twice"
+    if step > LARGEST_POINT:
+        return f"point_step {step} is larger than {LARGEST_POINT}"
     end = 0
     for name, offset, datatype, count in sorted(fields, key=lambda f: f[1]):
         kind = _DTYPES.get(datatype)
