@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pred_core.effects.effect import Effect
+from pred_core.errors import TwinError
 from pred_core.frames import quaternion_normalize, quaternion_to_matrix
 from pred_core.springmass import kernel
 from pred_core.twin import Extension
@@ -122,7 +123,10 @@ def fixture_row(fixture: Fixture) -> list[float]:
 
 
 def mass_of_worlds(body: Body, per_world: list[tuple[Extension, ...]], effects: tuple[type[Effect], ...]) -> Tensor:
-    """(W, N) [kg]: the body's masses with every `inertia` hook applied."""
+    """(W, N) [kg]: the body's masses with every `inertia` hook applied.
+
+    Raises: TwinError if a mass is not positive.
+    """
     arc = torch.as_tensor(body.arc)
     rows = []
     for extensions in per_world:
@@ -130,5 +134,9 @@ def mass_of_worlds(body: Body, per_world: list[tuple[Extension, ...]], effects: 
         for effect, extension in zip(effects, extensions, strict=True):
             if "inertia" in effect.hooks:
                 factor = factor + effect.inertia(extension.parameters, arc)
+        if bool((factor <= 0.0).any()):
+            ids = ", ".join(e.id for e in effects if "inertia" in e.hooks)
+            raise TwinError(f"effect '{ids}' makes a particle's mass negative", got=f"factor {float(factor.min()):.3g}",
+                            allowed="above 0")  # fmt: skip
         rows.append(torch.as_tensor(body.mass) * factor)
     return torch.stack(rows).to(torch.float32)

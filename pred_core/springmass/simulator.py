@@ -52,12 +52,14 @@ class SpringMass:
         per_world = extensions_per_world(extensions, len(self.physics))
         self.worlds = max(len(self.physics), len(per_world))
         self.effects = effects_of(per_world)
-        stiffest = [self.physics[w % len(self.physics)] for w in range(self.worlds)]
-        self.substeps = substeps or choose_substeps(body, period, stiffest, bend_bounds(per_world, self.worlds))
+        each = [self.physics[w % len(self.physics)] for w in range(self.worlds)]
+        self._mass = mass_of_worlds(body, per_world, self.effects).to(device)
+        masses = list(self._mass.double().cpu().numpy().repeat(self.worlds // len(self._mass), axis=0))
+        bounds = bend_bounds(per_world, self.worlds)
+        self.substeps = substeps or choose_substeps(body, period, each, bounds, masses=masses)
         self.diverged_as_nan = diverged_as_nan
         self.staged = device != "cpu" if staged is None else staged
         self._rows = parameter_rows(self.physics, per_world, self.effects).to(device)
-        self._mass = mass_of_worlds(body, per_world, self.effects).to(device)
         self._mask = spring_mask
         self._self_collision = self_collision
         self._arrays = ModelArrays.of(body, scene, device)

@@ -1,0 +1,155 @@
+"""Bending by angle and the material frame of a line, in float64 torch; the twin of `source_bending.py`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from pred_core.effects.effect import BendContext
+from pred_core.frames import quaternion_rotate
+
+if TYPE_CHECKING:
+    from pred_core.springmass.reference import Reference
+
+FOLD = 3e-4  # least 1 + t1.t2 with a finite curvature
+
+
+@dataclass
+class BendMemory:
+    """What a rollout remembers between substeps."""
+
+    twist: dict[int, Tensor] = field(default_factory=dict)  # per line (W,)
+    director: dict[int, Tensor] = field(default_factory=dict)  # per line (W, 3)
+    curvature: Tensor | None = None  # (W, B, 2)
+    effects: dict[int, tuple[Tensor, ...]] = field(default_factory=dict)  # per effect, (W, B) each
+
+
+def bend_forces(sim: Reference, x: Tensor, held: Tensor, rotation: Tensor, h: float, memory: BendMemory) -> Tensor:
+    """(W, N, 3) [N]: minus the gradient of EI/(2 lbar) |kb|^2, and the moments that effects add."""
+    force = torch.zeros_like(x)
+    if not sim.lines:
+        return force
+    i, j, k = torch.as_tensor(sim.body.bends, dtype=torch.long).T
+    a, b = x[:, j] - x[:, i], x[:, k] - x[:, j]
+    length_a, length_b = a.norm(dim=-1, keepdim=True), b.norm(dim=-1, keepdim=True)
+    a, b = a / length_a, b / length_b
+    q = 1.0 / (1.0 + _dot(a, b)).clamp_min(FOLD)
+    weight = sim.bending * sim.bend_rows[:, 0]
+    alpha = -4.0 * weight[..., None] * q * q
+    along_a, along_b = alpha * b, alpha * a
+    if sim.hooks("bend"):
+        first, second, directors = _moments(sim, x, held, rotation, h, memory, a, b, q, weight)
+        moment = first[..., None] * directors[0] + second[..., None] * directors[1]
+        triple = _dot(torch.linalg.cross(a, b), moment)
+        along_a = along_a + 2.0 * q * (torch.linalg.cross(b, moment) - triple * q * b)
+        along_b = along_b + 2.0 * q * (torch.linalg.cross(moment, a) - triple * q * a)
+    along_a = (along_a - _dot(along_a, a) * a) / length_a
+    along_b = (along_b - _dot(along_b, b) * b) / length_b
+    return force.index_add(1, i, along_a).index_add(1, j, along_b - along_a).index_add(1, k, -along_b)
+
+
+def _moments(
+    sim: Reference, x: Tensor, held: Tensor, rotation: Tensor, h: float, memory: BendMemory, a: Tensor, b: Tensor,
+    q: Tensor, weight: Tensor,
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:  # fmt: skip
+    """Moments (W, B) along the two directors of each bend, and the directors (W, B, 3)."""
+    bends = sim.body.bends
+    curvature = 2.0 * q * torch.linalg.cross(a, b)
+    d1, d2 = torch.zeros_like(a), torch.zeros_like(a)
+    for number, (begin, end) in enumerate(sim.lines):
+        ends = held[:, int(bends[begin, 0])], held[:, int(bends[end - 1, 2])]
+        line = slice(begin, end)
+        was = None if memory.curvature is None else memory.curvature[:, line]
+        u, twist = _start_frame(number, a[:, line], b[:, line], curvature[:, line], ends, rotation, memory, was)
+        memory.director[number], memory.twist[number] = u, twist
+        d1[:, line], d2[:, line] = _directors(u, a[:, line], b[:, line], twist[:, None] * sim.bend_rows[line, 3])
+    now = torch.stack((_dot(curvature, d1)[..., 0], _dot(curvature, d2)[..., 0]), -1)
+    change = torch.zeros_like(now) if memory.curvature is None else now - memory.curvature
+    memory.curvature = now
+    counts = torch.cat([torch.full((e - s,), float(e - s), dtype=x.dtype) for s, e in sim.lines])[None]
+    first, second = torch.zeros_like(weight), torch.zeros_like(weight)
+    for number, (effect, p) in enumerate(sim.hooks("bend")):
+        kept = memory.effects.get(number, (torch.zeros_like(weight),) * effect.bend_memory)
+        at = BendContext(
+            (now[..., 0], now[..., 1]), (change[..., 0], change[..., 1]), weight, counts,
+            torch.tensor(h, dtype=x.dtype), sim.bend_rows[:, 2][None], kept,
+        )  # fmt: skip
+        m1, m2, memory.effects[number] = effect.bend(p, at)
+        first, second = first + m1, second + m2
+    return first, second, (d1, d2)
+
+
+def _start_frame(
+    number: int, a: Tensor, b: Tensor, curvature: Tensor, ends: tuple[Tensor, Tensor], rotation: Tensor,
+    memory: BendMemory, was: Tensor | None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Director u (W, 3) at a line's first edge and the twist (W,) from its first to its last edge."""
+    at_first, at_last = ends[0] >= 0, ends[1] >= 0
+    start, finish = a[:, 0], b[:, -1]
+    u = _clamped(ends[0], -1.0, rotation, start)
+    d = u
+    for n in range(a.shape[1]):
+        d = _carry(d, a[:, n], b[:, n])
+    far = _clamped(ends[1], 1.0, rotation, finish)
+    side = torch.linalg.cross(finish, d)
+    angle = torch.atan2(_dot(far, side), _dot(far, d))[:, 0]
+    known = memory.twist.get(number, torch.zeros_like(angle))
+    change = angle - known
+    change = change - 2.0 * torch.pi * torch.round(change / (2.0 * torch.pi))
+    twist = torch.where(at_first & at_last, known + change, torch.zeros_like(angle))
+    u = torch.where((~at_first & at_last)[:, None], _turn(u, start, angle), u)
+    loose = _carried_in_time(u, start, a, b, curvature, memory.director.get(number), was)
+    return torch.where((~at_first & ~at_last)[:, None], loose, u), twist
+
+
+def _carried_in_time(
+    fallback: Tensor, start: Tensor, a: Tensor, b: Tensor, curvature: Tensor, last: Tensor | None, was: Tensor | None
+) -> Tensor:
+    """The director of a free line: the last one, turned so that the curvatures' components change least."""
+    if last is None or was is None:
+        return fallback
+    u = last - _dot(last, start) * start
+    u = u / u.norm(dim=-1, keepdim=True)
+    d1, d2 = _directors(u, a, b, torch.zeros(a.shape[:2], dtype=a.dtype))
+    k1, k2 = _dot(curvature, d1)[..., 0], _dot(curvature, d2)[..., 0]
+    sine, cosine = (was[..., 0] * k2 - was[..., 1] * k1).sum(-1), (was[..., 0] * k1 + was[..., 1] * k2).sum(-1)
+    return _turn(u, start, torch.atan2(sine, cosine))
+
+
+def _directors(u: Tensor, a: Tensor, b: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
+    """(W, B, 3) mean of the frames of each bend's two edges, with u (W, 3) carried along."""
+    d1, d2 = torch.zeros_like(a), torch.zeros_like(a)
+    for n in range(a.shape[1]):
+        after = _turn(_carry(u, a[:, n], b[:, n]), b[:, n], turn[:, n])
+        d1[:, n] = 0.5 * (u + after)
+        d2[:, n] = 0.5 * (torch.linalg.cross(a[:, n], u) + torch.linalg.cross(b[:, n], after))
+        u = after
+    return d1, d2
+
+
+def _clamped(which: Tensor, up: float, rotation: Tensor, t: Tensor) -> Tensor:
+    """The gripper's y axis across t; world y swung from the vertical where `which` is -1."""
+    y = torch.tensor([0.0, 1.0, 0.0], dtype=t.dtype).expand_as(t)
+    z = torch.tensor([0.0, 0.0, up], dtype=t.dtype)
+    d = y - t[:, 1:2] / (1.0 + up * t[:, 2:]).clamp_min(1e-3) * (t + z)
+    if rotation.shape[1]:
+        index = which.clamp_min(0).long()[:, None, None].expand(-1, 1, 4)
+        axis = quaternion_rotate(torch.gather(rotation, 1, index)[:, 0], y)
+        d = torch.where((which >= 0)[:, None], axis, d)
+    d = d - _dot(d, t) * t
+    return d / d.norm(dim=-1, keepdim=True)
+
+
+def _carry(d: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    return d - _dot(d, b) / (1.0 + _dot(a, b)).clamp_min(FOLD) * (a + b)
+
+
+def _turn(d: Tensor, axis: Tensor, angle: Tensor) -> Tensor:
+    return torch.cos(angle)[:, None] * d + torch.sin(angle)[:, None] * torch.linalg.cross(axis, d)
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return (a * b).sum(-1, keepdim=True)
