@@ -96,10 +96,8 @@ class PReD:
         """One step in its parts. Gradients flow to the network, never through the backbone."""
         if WINDOW not in state.memory:
             raise InputError("the state was not started by PReD", next_step="Call start(state, grip) first")
-        own = {k[len(BASE) :]: v for k, v in state.memory.items() if k.startswith(BASE)}
         with torch.no_grad():
-            plain = State(state.position.detach(), state.velocity.detach(), state.held, own)
-            predicted = self.base.step(plain, grip)
+            predicted = self.base.step(self.base_state(state), grip)
         residual, memory = self._residual(state, predicted)
         memory |= _prefixed(predicted.memory)
         corrected = State(
@@ -109,6 +107,11 @@ class PReD:
             memory=memory,
         )
         return Advance(corrected, predicted, residual)
+
+    def base_state(self, state: State) -> State:
+        """The state as the backbone sees it: its own memory, no gradient."""
+        own = {k[len(BASE) :]: v for k, v in state.memory.items() if k.startswith(BASE)}
+        return State(state.position.detach(), state.velocity.detach(), state.held, own)
 
     def _residual(self, state: State, predicted: State) -> tuple[Tensor, dict[str, Tensor]]:
         """Residual velocity (..., N, 3) [m/s] world, and the network's memory after this step."""

@@ -20,9 +20,9 @@ class TrainingConfig:
     loss: str = setting("square", choices=("square", "absolute"), doc="of the position error [mm]")
     gradient: str = setting(
         "detached",
-        choices=("detached", "ballistic"),
-        doc="detached: each step's own error (paper); ballistic: a correction also answers for later steps, "
-        "as if the backbone only carried it on at constant velocity",
+        choices=("detached", "ballistic", "differences"),
+        doc="detached: each step answers for its own error (paper); ballistic: also for later ones, as if the "
+        "backbone carried it on at constant velocity; differences: by the backbone's Jacobian (small objects)",
     )
     carry: int = setting(
         1,

@@ -14,8 +14,9 @@ from pred_core.frames import quaternion_from_rotation_vector, quaternion_to_matr
 from pred_core.pred import FRAME, Advance, PReD
 from pred_core.residual import binding_share
 from pred_core.train.config import TrainingConfig
+from pred_core.train.gradient import StepGradient, ballistic
 from pred_core.train.recordings import Batch
-from pred_core.types import State
+from pred_core.types import Grip, State
 
 MILLIMETRE = 1e3
 
@@ -71,13 +72,13 @@ def training_rollout(model: PReD, state: State, batch: Batch, config: TrainingCo
     steps = len(batch.target)
     for k in range(steps):
         step = model.advance(state, batch.grips.at(k))
-        arrived = _carried(state, step, model.period) if config.gradient == "ballistic" else step.state
+        arrived = _arrived(model, state, step, batch.grips.at(k), config.gradient)
         error = (arrived.position - batch.target[k]) * batch.seen[k].unsqueeze(-1) * MILLIMETRE
         total = total + (error.square() if config.loss == "square" else error.abs()).sum()
         penalty = penalty + (step.residual / model.network.config.cap).square().mean()
         absolute += error.detach().abs().sum()
         binding += binding_share(step.residual.detach(), step.state.held < 0, model.network.config.cap)
-        state = arrived if config.gradient == "ballistic" else _detached(arrived)
+        state = _detached(arrived) if config.gradient == "detached" else arrived
     loss = total / count + config.penalty * penalty / steps
     return Outcome(loss, float(absolute / count), float(binding / steps), _detached(state))
 
@@ -104,8 +105,12 @@ def _detached(state: State) -> State:
     return State(state.position.detach(), state.velocity.detach(), state.held, memory)
 
 
-def _carried(before: State, step: Advance, period: float) -> State:
-    """The step's state, equal in value, with the gradient of free flight through the backbone."""
-    velocity = before.velocity - before.velocity.detach()
-    position = before.position - before.position.detach() + period * velocity
-    return step.state.replace(position=step.state.position + position, velocity=step.state.velocity + velocity)
+def _arrived(model: PReD, before: State, step: Advance, grip: Grip, gradient: str) -> State:
+    """The step's state, equal in value, with the gradient the configuration asks for."""
+    if gradient == "detached":
+        return step.state
+    if gradient == "ballistic":
+        zeros = ballistic(before, model.period)
+    else:
+        zeros = StepGradient.apply(before.position, before.velocity, model.base, model.base_state(before), grip)
+    return step.state.replace(position=step.state.position + zeros[0], velocity=step.state.velocity + zeros[1])
