@@ -198,6 +198,7 @@ def _figures(page: Page, results: Sequence[Result], folder: Path, split: str) ->
     }
     for name, (figure, caption) in drawn.items():
         figure.savefig(folder / f"{split}_{name}.png", dpi=130)
+        figure.set_layout_engine("none")  # keep the layout just found: finding it is most of the drawing time
         page.figure(figure, caption)
     for label, name in (("Worst", worst), ("Median", median)):
         page.html(_animation([main, *_having(compared, name)], name, f"{label} episode, {name}."))
