@@ -14,7 +14,7 @@ class BendingDamping(Effect):
     id = "bending_damping"
     family = "internal loss"
     hooks = ("bend",)
-    parameters = (Parameter("time", "s", 0.0, 1.0, typical=0.02, doc="tau, ratio of bending viscosity to bending stiffness"),)
+    parameters = (Parameter("time", "s", 0.0, 1.0, typical=0.02, doc="tau, bending viscosity over bending stiffness"),)
     confounded_with = ("drag_linear", "bending_hysteresis")
 
     @classmethod

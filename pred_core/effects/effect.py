@@ -31,6 +31,7 @@ class Parameter:
     size: int = 1
     typical: float = 0.1  # how much of it matters: the first step of a search
     log: bool = False  # positive, searched on a log scale
+    starts: tuple[float, ...] = ()  # values a refinement starts from besides the present one (many optima)
     doc: str = ""
 
 
@@ -105,6 +106,7 @@ class Effect:
     parameters: ClassVar[tuple[Parameter, ...]]
     confounded_with: ClassVar[tuple[str, ...]] = ()
     bend_memory: ClassVar[int] = 0  # values a `bend` hook keeps per bend
+    end_twist: ClassVar[str] = ""  # the parameter [rad] by which a line's far material axes are turned in its gripper
 
     @classmethod
     def force(cls, p: Mapping[str, Any], at: ParticleContext) -> Vec3:
@@ -148,12 +150,13 @@ class Effect:
 
     @classmethod
     def extension(cls, **values: float | tuple[float, ...]) -> Extension:
-        """An `Extension` entry with these values; parameters not given are null."""
+        """An `Extension` entry with these values; parameters and last components not given are null."""
         merged = cls.null()
         for name, value in values.items():
             if name not in merged:
                 raise TwinError(f"effect '{cls.id}' has no parameter '{name}'", next_step=nearest(name, merged))
-            merged[name] = tuple(np.atleast_1d(np.asarray(value, dtype=float)).tolist())
+            given = tuple(np.atleast_1d(np.asarray(value, dtype=float)).tolist())
+            merged[name] = given + merged[name][len(given) :]
         return Extension(cls.id, cls.version, merged)
 
     @classmethod

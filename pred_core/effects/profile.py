@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-TERMS = 8  # coefficients of a profile; leave the high ones at zero for a smoother one
+TERMS = 12  # coefficients of a profile; leave the high ones at zero for a smoother one
 
 
 def legendre(coefficients: Sequence[Any], arc: Any) -> Any:

@@ -20,9 +20,14 @@ class RestCurvature(Effect):
     family = "bending"
     hooks = ("bend",)
     parameters = (
-        Parameter("first", "1", -1.0, 1.0, size=TERMS, typical=0.05, doc="Legendre coefficients of k0 along the first axis"),
-        Parameter("second", "1", -1.0, 1.0, size=TERMS, typical=0.05, doc="Legendre coefficients of k0 along the second axis"),
+        Parameter("first", "1", -1.0, 1.0, size=TERMS, typical=0.05, doc="k0 along the first axis, Legendre"),
+        Parameter("second", "1", -1.0, 1.0, size=TERMS, typical=0.05, doc="k0 along the second axis, Legendre"),
+        Parameter(
+            "twist", "rad", -4.0, 4.0, typical=0.3, starts=(-1.57, 1.57, 3.14),
+            doc="angle of the material in the last gripper against the first, untwisted"
+        ),
     )
+    end_twist = "twist"
     confounded_with = ("gravity_offset", "bending_hysteresis")
 
     @classmethod

@@ -23,8 +23,8 @@ from pred_core.identify.space import Candidate, Knob, SearchSpace, search_space
 from pred_core.identify.starts import track_noise
 from pred_core.identify.topology import Topology
 from pred_core.train.recordings import Recording, align, split_groups
-from pred_core.twin import Twin, TwinMeta
-from pred_core.types import Episode, Physics
+from pred_core.twin import Extension, Twin, TwinMeta
+from pred_core.types import Body, Episode, Physics
 
 Tell = Callable[[str], None]
 DISCRETE = ("connection_threshold", "max_springs")  # steps, not slopes: CMA-ES alone
@@ -64,10 +64,11 @@ def identify(
     noise = dataset.sigma if dataset.sigma is not None else track_noise(list(recordings))
     fit = _Fit(layout, period, noise if config.estimate_starts else None, config, generator, tell)
     space = _space(layout, config)
+    coarse = SearchSpace(tuple(k for k in space.knobs if not k.profile), space.physics, space.extensions)
 
     journal = Journal(journal_path, {"config": repr(config), "data": [r.name for r in recordings]})
-    restarts = fit.search(fitted, space, journal)
-    best = space.candidate(restarts[0].z)
+    restarts = fit.search(fitted, coarse, journal)
+    best = coarse.candidate(restarts[0].z)
     check = fit.check(best, held_out, "CMA-ES") if held_out else None
     polished, refined = fit.refine(fitted, space, best)
     if held_out:
@@ -76,7 +77,7 @@ def identify(
     body = fit.body(polished.physics)
     problem = fit.problem(recordings, config.stages[-1], body=body)
     losses = problem.losses([polished])[0]
-    values = _report(space, polished, restarts, refined, problem)
+    values = _report(space, coarse, polished, restarts, refined, problem)
     notes = [] if layout.mass_known else [f"mass is nominal ({config.mass:g} kg): motion alone does not show it"]
     meta = TwinMeta(
         object=dataset.object,
@@ -90,7 +91,7 @@ def identify(
     return Identified(
         twin=Twin(meta, body, polished.physics, layout.scene, _with_evidence(polished, values), None, physics_report),
         values=values,
-        restarts=[{"seed": r.seed, "loss_mm": 1e3 * r.loss, **space.values(r.z)} for r in restarts],
+        restarts=[{"seed": r.seed, "loss_mm": 1e3 * r.loss, **coarse.values(r.z)} for r in restarts],
         fitted_mm=1e3 * float(trimmed(losses[None])[0]),
         held_out_mm=check,
         windows={n: 1e3 * float(v) for n, v in zip(problem.windows.names, losses, strict=True)},
@@ -111,7 +112,10 @@ class _Fit:
     generator: torch.Generator
     tell: Tell
 
-    def problem(self, recordings: Sequence[Recording], seconds: float, body=None, topology=None, most=None) -> Problem:  # type: ignore[no-untyped-def]
+    def problem(
+        self, recordings: Sequence[Recording], seconds: float, *, body: Body | None = None,
+        topology: Topology | None = None, most: int | None = None,
+    ) -> Problem:  # fmt: skip
         """Windows of `seconds` over the recordings."""
         steps = round(min(seconds, 1e6) / self.period)
         count = most or (MOST_WINDOWS if seconds < 1e6 else len(recordings))
@@ -126,7 +130,7 @@ class _Fit:
             return None
         return Topology(self.layout.body, self.layout.longest, 8 if self.layout.body.kind == "line" else 24)
 
-    def body(self, physics: Physics):  # type: ignore[no-untyped-def]
+    def body(self, physics: Physics) -> Body:
         """The body with the springs these parameters make."""
         topology = self.topology()
         return self.layout.body if topology is None else topology.body(physics)
@@ -149,22 +153,42 @@ class _Fit:
     def refine(
         self, recordings: Sequence[Recording], space: SearchSpace, start: Candidate, stages: Sequence[float] = ()
     ) -> tuple[Candidate, Refined | None]:
-        """The local refinement of everything continuous, window lengths in order."""
+        """The local refinement of everything continuous, window lengths in order.
+
+        Knobs with several starts are tried from each through all stages but the last; the best goes on.
+        """
         body = self.body(start.physics)
-        knobs = tuple(k for k in space.knobs if k.name not in DISCRETE and not _inactive(k, self.layout))
-        refined = None
+        knobs = tuple(k for k in space.knobs if k.name not in DISCRETE)
         if self.config.iterations == 0 or not knobs:
             return start, None
-        for seconds in stages or self.config.stages:
-            local = SearchSpace(knobs, start.physics, start.extensions)
+        local = SearchSpace(knobs, start.physics, start.extensions).at(start)
+        seconds = list(stages or self.config.stages)
+        trials = [start]
+        for n, knob in enumerate(local.knobs):
+            for value in knob.starts if len(seconds) > 1 else ():
+                z = local.start()
+                z[n] = knob.coordinate(value)
+                trials.append(local.candidate(z))
+        ends = [self._stages(recordings, local, trial, body, seconds[:-1]) for trial in trials]
+        if len(trials) > 1:
+            ends.sort(key=lambda end: end[1].loss if end[1] is not None else np.inf)
+        return self._stages(recordings, local, ends[0][0], body, seconds[-1:])
+
+    def _stages(
+        self, recordings: Sequence[Recording], space: SearchSpace, start: Candidate, body: Body, stages: Sequence[float]
+    ) -> tuple[Candidate, Refined | None]:
+        refined = None
+        for seconds in stages:
             problem = self.problem(recordings, seconds, body=body)
-            z = np.array([k.coordinate(v) for k, v in zip(local.knobs, _present(local, start), strict=True)])
+            local = space.at(start)
 
-            def report(done: int, planned: int, loss: float, windows=problem.windows) -> None:  # type: ignore[no-untyped-def]
-                length = windows.target.shape[0] * self.period
-                self.tell(f"refine: {windows.count} windows of {length:.1f} s, step {done}/{planned}, {1e3 * loss:.3f} mm")
+            def report(done: int, planned: int, loss: float, problem: Problem = problem) -> None:
+                length = problem.windows.target.shape[0] * self.period
+                self.tell(
+                    f"refine: {problem.windows.count} windows of {length:.1f} s, step {done}/{planned}, {1e3 * loss:.3f} mm"
+                )
 
-            refined = refine(problem, local, z, self.config.iterations, self.config.stride, report)
+            refined = refine(problem, local, local.start(), self.config.iterations, self.config.stride, report)
             start = local.candidate(refined.z)
         return start, refined
 
@@ -198,16 +222,7 @@ def _space(layout: Layout, config: IdentifyConfig) -> SearchSpace:
     return SearchSpace(tuple(knobs), space.physics, space.extensions)
 
 
-def _inactive(knob: Knob, layout: Layout) -> bool:
-    return knob.name == "ground_friction" and layout.scene.ground is None
-
-
-def _present(space: SearchSpace, candidate: Candidate) -> list[float]:
-    """Values of the knobs at a candidate."""
-    return [k.start for k in space.at(candidate).knobs]
-
-
-def _with_evidence(candidate: Candidate, values: dict[str, dict[str, object]]):  # type: ignore[no-untyped-def]
+def _with_evidence(candidate: Candidate, values: dict[str, dict[str, object]]) -> tuple[Extension, ...]:
     return tuple(
         dataclasses.replace(e, evidence={k.split(".", 1)[1]: v for k, v in values.items() if k.startswith(e.id + ".")})
         for e in candidate.extensions
@@ -215,25 +230,27 @@ def _with_evidence(candidate: Candidate, values: dict[str, dict[str, object]]): 
 
 
 def _report(
-    space: SearchSpace, best: Candidate, restarts: list[Restart], refined: Refined | None, problem: Problem
+    space: SearchSpace, coarse: SearchSpace, best: Candidate, restarts: list[Restart], refined: Refined | None,
+    problem: Problem,
 ) -> dict[str, dict[str, object]]:
     """Per knob: value, unit, spread over restarts, interval, sensitivity, bound flag."""
     here = space.at(best)
     sensitivity = sensitivities(problem, here)
     names = [k.name for k in here.knobs if refined is not None and k.name not in DISCRETE]
+    searched = {k.name for k in coarse.knobs}
     result: dict[str, dict[str, object]] = {}
     for n, knob in enumerate(here.knobs):
-        close = [r for r in restarts if r.loss <= 1.05 * restarts[0].loss]
-        spread = [space.knobs[n].value(float(r.z[n])) for r in close]
         entry: dict[str, object] = {
             "value": round(knob.start) if knob.name == "max_springs" else knob.start,
             "unit": knob.unit,
             "low": knob.low,
             "high": knob.high,
-            "spread": [min(spread), max(spread)],
             "sensitivity": sensitivity[n],
             "at_bound": bool(knob.at_bound(knob.start)),
         }
+        if knob.name in searched:
+            spread = [coarse.values(r.z)[knob.name] for r in restarts if r.loss <= 1.05 * restarts[0].loss]
+            entry["spread"] = [min(spread), max(spread)]
         if refined is not None and knob.name in names:
             width = 1.96 * float(np.sqrt(max(refined.covariance[names.index(knob.name), names.index(knob.name)], 0.0)))
             entry["interval"] = [knob.value(-width), knob.value(width)]

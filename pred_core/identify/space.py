@@ -18,6 +18,7 @@ from pred_core.errors import ConfigError, nearest
 from pred_core.twin import Extension
 from pred_core.types import Array, Physics
 
+WIDEST_VECTOR = 3  # components; a longer parameter is a profile
 LOG_STEPS = 6.0  # PhysTwin's choice: a first step is a sixth of the range
 
 
@@ -32,6 +33,8 @@ class Knob:
     log: bool
     start: float
     scale: float
+    profile: bool = False  # a coefficient of a profile, or an angle with many optima: refined, not searched globally
+    starts: tuple[float, ...] = ()  # other values a refinement starts from
 
     def value(self, z: float) -> float:
         """The parameter's value, inside its bounds."""
@@ -124,10 +127,11 @@ def search_space(
         effect = find_effect(id)
         present.setdefault(id, effect.extension())
         for q in effect.parameters:
-            for k in range(q.size if q.size <= 3 else min(terms, q.size)):
+            for k in range(min(terms, q.size) if q.size > WIDEST_VECTOR else q.size):
                 value = present[id].parameters[q.name][k]
                 start = max(value, q.low) if q.log else value
-                knobs.append(Knob(f"{id}.{q.name}[{k}]", q.unit, q.low, q.high, q.log, start, q.typical))
+                profile = q.size > WIDEST_VECTOR or bool(q.starts)
+                knobs.append(Knob(f"{id}.{q.name}[{k}]", q.unit, q.low, q.high, q.log, start, q.typical, profile, q.starts))
     return SearchSpace(tuple(knobs), physics, tuple(present.values()))
 
 

@@ -120,6 +120,7 @@ def kernel_text(effects: tuple[type[Effect], ...], lanes: int, staged: bool) -> 
         "@ONE_BEND@": source_bending.ONE_BEND_FRAMED if framed else source_bending.ONE_BEND,
         "@BEND_FRAME@": source_bending.BEND_FRAME if framed else "",
         "@BEND_MOMENT@": source_bending.BEND_MOMENT if framed else "",
+        "@END_TWIST@": _end_twist(effects),
     }
     for placeholder, statements in (*parts.items(), *_laws(effects).items()):
         text = text.replace(placeholder, statements)
@@ -175,6 +176,17 @@ def _laws(effects: tuple[type[Effect], ...]) -> dict[str, str]:
             slot += effect.bend_memory
         row += sum(q.size for q in effect.parameters)
     return {placeholder: "\n    ".join(lines) for placeholder, lines in parts.items()}
+
+
+def _end_twist(effects: tuple[type[Effect], ...]) -> str:
+    """The sum of the parameters by which effects turn the far end of a line [rad]."""
+    places, row = ["zero"], BASE_PARAMETERS
+    for effect in effects:
+        for q in effect.parameters:
+            if q.name == effect.end_twist:
+                places.append(f"P[{row}]")
+            row += q.size
+    return " + ".join(places)
 
 
 def _parameters(code: Code, effect: type[Effect], row: int) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def _moments(
         ends = held[:, int(bends[begin, 0])], held[:, int(bends[end - 1, 2])]
         line = slice(begin, end)
         was = None if memory.curvature is None else memory.curvature[:, line]
-        u, twist = _start_frame(number, a[:, line], b[:, line], curvature[:, line], ends, rotation, memory, was)
+        u, twist = _start_frame(number, a[:, line], b[:, line], curvature[:, line], ends, rotation, memory, was, _end_twist(sim))
         memory.director[number], memory.twist[number] = u, twist
         d1[:, line], d2[:, line] = _directors(u, a[:, line], b[:, line], twist[:, None] * sim.bend_rows[line, 3])
     now = torch.stack((_dot(curvature, d1)[..., 0], _dot(curvature, d2)[..., 0]), -1)
@@ -82,9 +82,18 @@ def _moments(
     return first, second, (d1, d2)
 
 
+def _end_twist(sim: Reference) -> Tensor:
+    """(1,) or (W,) [rad]: by how much effects turn the far end of a line."""
+    total = torch.zeros(1, dtype=torch.float64)
+    for effect, p in sim.hooks("bend"):
+        if effect.end_twist:
+            total = total + p[effect.end_twist][0].reshape(-1)
+    return total
+
+
 def _start_frame(
     number: int, a: Tensor, b: Tensor, curvature: Tensor, ends: tuple[Tensor, Tensor], rotation: Tensor,
-    memory: BendMemory, was: Tensor | None,
+    memory: BendMemory, was: Tensor | None, offset: Tensor,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Director u (W, 3) at a line's first edge and the twist (W,) from its first to its last edge."""
     at_first, at_last = ends[0] >= 0, ends[1] >= 0
@@ -97,7 +106,7 @@ def _start_frame(
     side = torch.linalg.cross(finish, d)
     angle = torch.atan2(_dot(far, side), _dot(far, d))[:, 0]
     known = memory.twist.get(number, torch.zeros_like(angle))
-    change = angle - known
+    change = angle - offset - known
     change = change - 2.0 * torch.pi * torch.round(change / (2.0 * torch.pi))
     twist = torch.where(at_first & at_last, known + change, torch.zeros_like(angle))
     u = torch.where((~at_first & at_last)[:, None], _turn(u, start, angle), u)

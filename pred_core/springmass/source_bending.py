@@ -124,7 +124,7 @@ FRAME = r"""
     const Lane wx = ay * d[2] - az * d[1], wy = az * d[0] - ax * d[2], wz = ax * d[1] - ay * d[0];
     const Lane across = r[0] * wx + r[1] * wy + r[2] * wz, ahead = r[0] * d[0] + r[1] * d[1] + r[2] * d[2];
     const Lane known = lane_select(fresh > zero, zero, kept[0]);
-    Lane change = lane_atan2(across, ahead) - known;
+    Lane change = lane_atan2(across, ahead) - (@END_TWIST@) - known;
     change -= 6.283185307f * lane_round(change * 0.159154943f);
     const Lane free_first = lane_select(first < zero, one, zero), free_last = lane_select(last < zero, one, zero);
     twist = lane_select(free_first + free_last > zero, zero, known + change);
