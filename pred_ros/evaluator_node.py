@@ -7,11 +7,10 @@ In: tracker/points, prediction/points, player/episode. Out: /diagnostics; at the
 from __future__ import annotations
 
 import math
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NoReturn
 
 import torch
 from rclpy.subscription import Subscription
@@ -21,11 +20,11 @@ from std_msgs.msg import String
 from pred_core.bag.wire import PREDICTION_POINTS, TRACKER_POINTS
 from pred_core.config import setting
 from pred_core.errors import ConfigError, PredError
-from pred_ros import convert, marks, qos
+from pred_ros import convert, marks, qos, shell
 from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.live_report import write_results
 from pred_ros.scoring import Scorer
-from pred_ros.shell import Shell, run
+from pred_ros.shell import Shell
 
 REFUSED_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
 
@@ -161,10 +160,10 @@ class EvaluatorNode(Shell):
         self.report(ERROR, self._refused)
 
 
-def main() -> int:
+def main() -> NoReturn:
     """Entry point of `ros2 run pred_ros evaluator`."""
-    return run(EvaluatorNode)
+    shell.main(EvaluatorNode)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -6,13 +6,12 @@ Out: tracker/points, gripper/pose, gripper/closed (latched too), player/episode 
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 from geometry_msgs.msg import PoseArray
 from rclpy.duration import Duration
@@ -26,10 +25,10 @@ from std_srvs.srv import SetBool
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
 from pred_core.config import setting
 from pred_core.errors import ConfigError, InputError, PredError
-from pred_ros import convert, marks, qos
+from pred_ros import convert, marks, qos, shell
 from pred_ros.diagnostics import OK, WARN
 from pred_ros.playlist import Clip, Timed, find_clips, stream
-from pred_ros.shell import Shell, run
+from pred_ros.shell import Shell
 
 LATE = 0.05  # [s] behind its schedule before the player says so
 FLUSH = 20.0  # [s] for the readers to acknowledge the last messages
@@ -238,10 +237,10 @@ class PlayerNode(Shell):
         self.diagnostics.count(f"messages on {message.topic}")
 
 
-def main() -> int:
+def main() -> NoReturn:
     """Entry point of `ros2 run pred_ros player`."""
-    return run(PlayerNode)
+    shell.main(PlayerNode)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

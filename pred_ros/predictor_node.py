@@ -7,12 +7,11 @@ In: tracker/points, gripper/pose, gripper/closed. Out: state/points (at the newe
 from __future__ import annotations
 
 import queue
-import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NoReturn
 
 import numpy as np
 import torch
@@ -30,10 +29,10 @@ from pred_core.config import setting
 from pred_core.dynamics import Dynamics
 from pred_core.errors import ConfigError, DivergenceError, PredError, TwinError
 from pred_core.twin import Twin
-from pred_ros import convert, qos
+from pred_ros import convert, qos, shell
 from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.prediction import Predictor, Rules
-from pred_ros.shell import Shell, run
+from pred_ros.shell import Shell
 
 REFUSED_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
 
@@ -289,10 +288,10 @@ class PredictorNode(Shell):
             self.diagnostics.count("predictions")
 
 
-def main() -> int:
+def main() -> NoReturn:
     """Entry point of `ros2 run pred_ros predictor`."""
-    return run(PredictorNode)
+    shell.main(PredictorNode)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

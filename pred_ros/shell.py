@@ -5,9 +5,10 @@ A node is a subclass of `Shell` with three methods (`setup`, `start`, `stop`); i
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
-from typing import Any, ClassVar, Protocol, cast
+from typing import Any, ClassVar, NoReturn, Protocol, cast
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -48,6 +49,7 @@ class Shell(LifecycleNode):
         self.config: Any = parameters.declare(self, self.CONFIG, given)
         parameters.follow(self, lambda: self.config, self._accept)
         self.exit_code: int | None = None
+        self.bug: BaseException | None = None
         self.diagnostics = Diagnostics(self.get_fully_qualified_name())
         self._diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._timer = self.create_timer(1.0, self._heartbeat)
@@ -113,6 +115,9 @@ class Shell(LifecycleNode):
         except PredError as error:
             self.fail(error)
             return TransitionCallbackReturn.FAILURE
+        except BaseException as bug:  # the client library would swallow it; `run` raises it again
+            self.bug = bug
+            raise
         return TransitionCallbackReturn.SUCCESS
 
     def _accept(self, config: Any) -> None:
@@ -151,14 +156,28 @@ def run(node_class: type[Shell], args: list[str] | None = None) -> int:
         rclpy.try_shutdown()
 
 
+def main(node_class: type[Shell]) -> NoReturn:
+    """Entry point of a node: `run`, then leave at once.
+
+    Everything is closed when `run` returns; unloading torch and Warp in the interpreter's own teardown takes up to
+    two seconds on a busy machine, and a node that was told to stop must be gone.
+    """
+    code = run(node_class)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
 def _spin(node: Shell, asked: list[int]) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
         if node.config.autostart:
-            node.trigger_configure()
-            if node.exit_code is None:
-                node.trigger_activate()
+            for transition in (node.trigger_configure, node.trigger_activate):
+                if node.exit_code is None:
+                    transition()
+                if node.bug is not None:
+                    raise node.bug
         while node.exit_code is None and not asked:
             executor.spin_once(timeout_sec=POLL)
         return node.exit_code or 0

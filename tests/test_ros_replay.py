@@ -46,10 +46,12 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def wait_for(condition: Callable[[], bool], limit: float, what: str) -> None:
-    """Poll until the condition holds; fail after `limit` [s]."""
+def wait_for(condition: Callable[[], bool], limit: float, what: str, children: Children | None = None) -> None:
+    """Poll until the condition holds; fail after `limit` [s], or at once if one of `children` ended badly."""
     end = time.monotonic() + limit
     while not condition():
+        for name, process in (children.running if children else {}).items():
+            assert process.poll() in (None, 0), children.log(name)  # type: ignore[union-attr]
         assert time.monotonic() < end, f"not within {limit} s: {what}"
         time.sleep(0.02)
 
@@ -85,12 +87,12 @@ def test_a_killed_predictor_comes_back_in_mid_replay(twin: Path, tmp_path: Path)
         children.start("predictor", node_command("predictor", parameters))
         player = {"bag": SAMPLE, "split": "all", "factor": 1.5, "wait_for": 2, "patience": 60.0}
         children.start("player", node_command("player", player))
-        wait_for(lambda: "mean error" in children.log("evaluator"), 60.0, "the first scores")
+        wait_for(lambda: "mean error" in children.log("evaluator"), 30.0, "the first scores", children)
         os.killpg(children.running["predictor"].pid, signal.SIGKILL)
         children.running["predictor"].wait()
         children.start("predictor", node_command("predictor", parameters))
         evaluator = children.running["evaluator"]
-        wait_for(lambda: evaluator.poll() is not None, 60.0, "the end of the replay")
+        wait_for(lambda: evaluator.poll() is not None, 60.0, "the end of the replay", children)
         assert evaluator.returncode == 0, children.log("evaluator")
         assert "predicting" in children.log("predictor")
     written = json.loads((tmp_path / "metrics.json").read_text())
@@ -106,7 +108,7 @@ def test_every_node_ends_within_two_seconds(number: signal.Signals, twin: Path, 
         children.start("predictor", node_command("predictor", {"twin": twin, "held": HELD, "wait_for": 1}))
         player = {"bag": SAMPLE, "factor": 0.2, "wait_for": 2, "loop": True, "patience": 60.0}
         children.start("player", node_command("player", player))
-        wait_for(lambda: "mean error" in children.log("evaluator"), 60.0, "all three at work")
+        wait_for(lambda: "mean error" in children.log("evaluator"), 30.0, "all three at work", children)
         for name in ("player", "predictor", "evaluator"):
             process = children.running[name]
             begin = time.monotonic()
@@ -125,9 +127,10 @@ def test_a_failing_node_ends_the_replay_with_its_own_line(tmp_path: Path) -> Non
 
 
 def test_children_that_ignore_signals_are_killed_with_their_children(tmp_path: Path) -> None:
-    stubborn = (
+    stubborn = (  # ignores SIGINT and has a child of its own
         "import signal, subprocess, sys, time; signal.signal(signal.SIGINT, signal.SIG_IGN);"
-        "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)']); print('up', flush=True); time.sleep(60)"
+        "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)']);"
+        "print('up', flush=True); time.sleep(60)"
     )
     with Children(dict(os.environ), tmp_path) as children:
         process = children.start("stubborn", [sys.executable, "-c", stubborn])
