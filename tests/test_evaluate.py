@@ -1,7 +1,9 @@
 """Evaluation: the protocol, statistics that hide nothing, and the command from bags to metrics.json."""
 
+import dataclasses
 import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from pred_core.errors import DatasetError, DivergenceError, InputError, TwinErro
 from pred_core.evaluate.bootstrap import bootstrap_interval
 from pred_core.evaluate.cache import PredictionCache
 from pred_core.evaluate.evaluation import EpisodeStore, Result, entry, run_model
-from pred_core.evaluate.models import Model
+from pred_core.evaluate.models import Model, NamedTwin, twin_models
 from pred_core.evaluate.protocol import diverged_at, predict
 from pred_core.evaluate.scores import score_episode, statistics
 from pred_core.evaluate.splits import Fold, Split, grouped, published
@@ -248,6 +250,23 @@ def test_command_interrupted_and_run_again_writes_json_and_report(dataset, tmp_p
     report = (out / "report.html").read_text()
     assert "http://" not in report.replace("http://www.w3.org", "") and "src=\"http" not in report, "self-contained"
     assert "connection_threshold" in report and "<canvas" not in report and 'createElement("canvas")' in report
+
+
+def test_each_fold_is_predicted_by_its_own_twin_and_fitting_on_tested_bags_is_counted(dataset, tmp_path):
+    twin = Twin.load(Path(small_twin(tmp_path / "twin", range(6))))
+    tested = dataset.sha256(dataset.select("test")[0])
+    twin = twin.replace(meta=dataclasses.replace(twin.meta, data=(tested, "another")))
+    # The fold twins step differently, so that each is known by its period.
+    folds = tuple(twin.replace(meta=dataclasses.replace(twin.meta, period=p)) for p in (0.02, 0.03))
+    (model,) = twin_models(NamedTwin("", twin, folds))
+    episodes = EpisodeStore(dataset).read(dataset.select("test"))
+    assert [model.build(episodes, (), f).period for f in (None, 0, 1)] == [0.01, 0.02, 0.03]
+    assert model.fold_twins == 2
+    with pytest.raises(TwinError, match="no twin for fold 2"):
+        model.build(episodes, (), 2)
+    split, cache = published(dataset, "test"), PredictionCache(tmp_path)
+    result = run_model(model, split, EpisodeStore(dataset), cache, lambda _: None)
+    assert result.tested_on_training_data == 1
 
 
 @pytest.mark.parametrize(
