@@ -11,6 +11,7 @@ from residual_case import PERIOD, Falling, episodes, line_body
 
 from pred_core.errors import DatasetError
 from pred_core.train import Recording, align
+from pred_core.train.outliers import backbone_error, leave_out
 from pred_core.train.recordings import gather, split_groups, window_index
 from pred_core.types import Episode, Grip
 
@@ -74,6 +75,17 @@ def test_batch_reproduces_the_recording() -> None:
     base = Falling()  # made the data, so from the right start it meets every target
     got = base.rollout(base.start(batch.start, batch.start_grip), batch.grips)
     assert torch.allclose(got, batch.target, atol=1e-5)
+
+
+def test_outliers_are_those_the_backbone_fails_on() -> None:
+    # Four throws in vacuum and one in air: free fall explains four of them exactly.
+    data = recordings(4) + [align(episodes(Falling(drag=3.0), 1, 12, seed=7)[0], line_body(), PERIOD)]
+    error = backbone_error(Falling(drag=0.1), data)
+    assert error[:4].max() < 0.1 * error[4]  # a wrong drag of 0.1/s against one of 2.9/s
+    kept, left_out = leave_out(Falling(drag=0.1), data, factor=3.0)
+    assert [r.name for r in kept] == ["throw0", "throw1", "throw2", "throw3"] and len(left_out) == 1
+    assert left_out[0].error_mm == pytest.approx(float(error[4])) and left_out[0].median_mm < 0.1 * float(error[4])
+    assert leave_out(Falling(), data, factor=0.0) == (data, [])
 
 
 def test_groups_are_never_split() -> None:

@@ -23,6 +23,7 @@ from pred_core.pred import load_base
 from pred_core.residual import ResidualConfig
 from pred_core.train import Trainer, TrainingConfig, align
 from pred_core.train.checkpoint import load_checkpoint, read_facts
+from pred_core.train.outliers import leave_out
 from pred_core.train.report import write_report
 from pred_core.train.run import CHECKPOINT_SECONDS, run_training
 from pred_core.twin import Twin
@@ -88,7 +89,12 @@ def build_trainer(
     episodes: list[Episode] = list(dataset.episodes("train"))
     recordings = [align(episode, twin.body, twin.meta.period) for episode in episodes]
     base = load_base(twin, device)
-    return Trainer(base, twin.body, recordings, training, network, twin.scene.gravity, device)
+    kept, left_out = leave_out(base, recordings, training.outlier)
+    for out in left_out:
+        _tell(f"left out {out.name}: backbone error {out.error_mm:.2f} mm, median {out.median_mm:.2f} mm (--outlier)")
+    trainer = Trainer(base, twin.body, kept, training, network, twin.scene.gravity, device)
+    trainer.left_out = left_out
+    return trainer
 
 
 def _check_device(name: str) -> None:

@@ -36,6 +36,9 @@ class TrainingConfig:
     noise_velocity: float = setting(0.0, unit="m/s", low=0.0, high=10.0, doc="standard deviation added to starts")
     average: float = setting(0.99, low=0.0, high=0.99999, doc="decay of the averaged weights that are kept")
     stride: int = setting(1, low=1, high=10_000, doc="frames between starts of windows")
+    outlier: float = setting(
+        0.0, low=0.0, high=1e6, doc="leave out train recordings whose backbone error exceeds this times the median"
+    )
     holdout: float = setting(0.15, low=0.0, high=0.9, doc="share of train recordings that choose the step; 0: last")
     holdout_frames: int = setting(500, low=1, high=100_000, doc="longest rollout on held-out recordings [periods]")
     evaluate_every: int = setting(200, low=1, high=1_000_000, doc="optimiser steps between held-out rollouts")

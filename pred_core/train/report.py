@@ -31,6 +31,8 @@ def _page(summary: dict[str, Any], command: str) -> str:
             "held-out share of components at the cap": f"{curves['held_out_binding'][best]:.1%}",
             "held out": ", ".join(summary["held_out"]),
         }
+    if summary["left_out"]:
+        rows["left out of training"] = ", ".join(f"{r['name']} ({r['error_mm']:.1f} mm)" for r in summary["left_out"])
     rows |= {
         "training share of components at the cap, last tenth": f"{_tail(curves['binding']):.1%}",
         "network parameters": f"{summary['parameters']}",

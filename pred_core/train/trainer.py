@@ -17,6 +17,7 @@ from pred_core.errors import DivergenceError
 from pred_core.pred import PReD
 from pred_core.residual import ResidualConfig, ResidualNetwork, build_network
 from pred_core.train.config import TrainingConfig
+from pred_core.train.outliers import LeftOut
 from pred_core.train.recordings import Batch, Recording, beginnings, gather, split_groups, window_index
 from pred_core.train.rollout import Outcome, held_out_error, training_rollout, training_start
 from pred_core.train.slots import Slots, refill
@@ -59,6 +60,7 @@ class Trainer:
             self.index = beginnings(self.index)
         self.slots: Slots | None = None
         self.held_out = held_out
+        self.left_out: list[LeftOut] = []  # what a rule took away before; reported
         self.held_out_batch = self._held_out_batch(held_out)
         self.network = build_network(network, config.seed).to(self.device)
         self.average = copy.deepcopy(self.network).requires_grad_(False)
@@ -152,6 +154,7 @@ class Trainer:
             "windows": len(self.index),
             "fitted_on": [r.name for r in self.fit],
             "held_out": [r.name for r in self.held_out],
+            "left_out": [dataclasses.asdict(r) for r in self.left_out],
             "step": self.step,
             "best_step": self.best_step,
             "seconds": round(self.seconds, 3),
