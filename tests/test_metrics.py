@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pred_core import metrics
 from pred_core.errors import InputError
-from pred_core.metrics.chamfer_batch import chamfer_two_sided_batch
+from pred_core.metrics.chamfer_batch import by_distance_matrix, chamfer_two_sided_batch
 from pred_core.metrics.lpips import Lpips
 
 # Two points; prediction off by (3, 4, 0) and by (0, 0, 1).
@@ -61,6 +61,9 @@ def test_batched_chamfer_equals_the_plain_one(sizes):
     assert np.allclose(chamfer_two_sided_batch(a, b).numpy(), expected, atol=1e-5)
     shared = [metrics.chamfer_two_sided(x.double().numpy(), b[0].double().numpy()) for x in a]
     assert np.allclose(chamfer_two_sided_batch(a, b[:1]).numpy(), shared, atol=1e-5)
+    # The form used on CUDA, here on CPU.
+    assert np.allclose(by_distance_matrix(a, b).numpy(), expected, atol=1e-5)
+    assert np.allclose(by_distance_matrix(a, b[:1]).numpy(), shared, atol=1e-5)
 
 
 def test_batched_chamfer_sees_both_sides():

@@ -79,7 +79,9 @@ def error_by_episode(results: Sequence[Result], main: Result) -> Figure:
 def error_on_object(results: Sequence[Result]) -> Figure:
     """Per particle and direction: mean absolute and signed error; the spectrum of the error; error against speed."""
     figure = Figure(figsize=(12, 2.9 * len(results)), layout="constrained")
-    grid = figure.subplots(len(results), 4, squeeze=False, gridspec_kw={"width_ratios": (1, 1, 0.75, 0.75)})
+    grid = figure.subplots(
+        len(results), 4, squeeze=False, sharey="col", gridspec_kw={"width_ratios": (1, 1, 0.75, 0.75)}
+    )
     for row, result in zip(grid, results, strict=True):
         predictions, episodes = usable(result)
         where = error_map(predictions, episodes)
@@ -96,14 +98,14 @@ def error_on_object(results: Sequence[Result]) -> Figure:
         row[2].set_ylim(0, 103)
         speed, error = error_by_speed(predictions, episodes)
         row[3].plot(speed, error * CM, color=INK, marker="o", markersize=3.5)
-        row[3].set_ylim(bottom=0)
         row[3].set_xlim(left=0)
-        row[0].set_ylim(bottom=0)
         row[0].set_title(result.model.name, loc="left", fontsize=11, fontweight="bold", color=INK)
         tidy(row[0], "particle id", "mean |error| [cm]")
         tidy(row[1], "particle id", "mean signed error [cm]")
         tidy(row[2], "frequency [Hz]", "squared error below [%]")
-        tidy(row[3], "speed of the held particles [m/s]", "error per coordinate [cm]")
+        tidy(row[3], "gripper speed [m/s]", "error per coordinate [cm]")
+    for column in (0, 3):  # axes of a column are shared: the rows compare
+        grid[0, column].set_ylim(bottom=0)
     grid[0, 0].legend(frameon=False, fontsize=8)
     return figure
 
