@@ -67,7 +67,7 @@ class PReD:
             )
         base = self.base.start(state, grip)
         leading = state.position.shape[:-2]
-        buffer = Buffer.empty(leading.numel(), self.network.config.window, state.position)
+        buffer = Buffer.empty(leading.numel(), self.network.config.window, base.position)
         memory = _prefixed(base.memory)
         memory[PAST_POSITION] = base.position - base.velocity * self.period
         memory[PAST_VELOCITY] = base.velocity
