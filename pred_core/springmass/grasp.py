@@ -12,6 +12,8 @@ from pred_core.types import Grip, State
 
 def grip_offsets(position: Tensor, held: Tensor, grip: Grip) -> Tensor:
     """Where held particles sit in their gripper's frame, (W, N, 3) [m]; zero for free particles."""
+    if grip.position.shape[1] == 0:
+        return torch.zeros_like(position)
     index = held.clamp_min(0).long()
     p = torch.gather(grip.position, 1, index[..., None].expand(*index.shape, 3))
     q = torch.gather(grip.rotation, 1, index[..., None].expand(*index.shape, 4))
@@ -73,6 +75,8 @@ def close_and_open(state: State, before: Grip, closed: Tensor, radius: float) ->
     A gripper that closes takes free particles within `radius` [m] of its origin; one that opens lets go.
     """
     held, offset = state.held, state.memory["grip_offset"]
+    if closed.shape[1] == 0:
+        return held, offset
     opened = before.closed & ~closed
     released = (held >= 0) & torch.gather(opened, 1, held.clamp_min(0).long())
     held = torch.where(released, torch.full_like(held, -1), held)

@@ -111,6 +111,8 @@ class SpringMass:
         periods = grips.position.shape[0] if grips.position.dim() > 2 else 0
         if periods == 0:
             raise InputError("grips of a rollout", got=f"shape {tuple(grips.position.shape)}", allowed="(T, ..., G, 3)")
+        for _ in range(len(lead) - grips.position.dim() + 3):  # the same poses for every world
+            grips = Grip(grips.position.unsqueeze(1), grips.rotation.unsqueeze(1), grips.closed.unsqueeze(1))
         stacked = grasp.flatten_grip(grips, torch.Size((periods, *lead)), self.device)
         stacked = Grip(*(v.unflatten(0, (periods, lead.numel())) for v in vars(stacked).values()))
         spans = [(t, t + 1) for t in range(periods)] if self._self_collision else _constant_spans(stacked.closed)

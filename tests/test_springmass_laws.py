@@ -1,0 +1,200 @@
+"""Laws of mechanics that the simulator must obey."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import brentq
+from springmass_cases import NOWHERE, blob, holding, line, nobody, particles, state_of, still
+from torch import Tensor
+
+from pred_core.effects import LIBRARY
+from pred_core.frames import rotation_about_z
+from pred_core.springmass import SpringMass
+from pred_core.springmass.arrays import bend_lengths
+from pred_core.types import Body, Grip, Physics, Scene, State
+
+G = 9.81
+
+
+def run(sim: SpringMass, state: State, periods: int) -> tuple[Tensor, State]:
+    return sim.rollout_states(sim.start(state), nobody(periods))
+
+
+def energy(body: Body, physics: Physics, state: State) -> float:
+    """Kinetic, elastic, bending and potential energy [J]."""
+    x, v, m = state.position.double(), state.velocity.double(), torch.as_tensor(body.mass)
+    i, j = torch.as_tensor(body.springs, dtype=torch.long).T
+    rest = torch.as_tensor(body.rest_length)
+    stretch = (x[j] - x[i]).norm(dim=-1) - rest
+    k = physics.stiffness * torch.as_tensor(body.stiffness_scale) / rest
+    total = 0.5 * (m * v.square().sum(-1)).sum() + 0.5 * (k * stretch.square()).sum()
+    if len(body.bends):
+        a, b, c = (x[torch.as_tensor(body.bends[:, n], dtype=torch.long)] for n in range(3))
+        cosine = torch.cosine_similarity(b - a, c - b, dim=-1)
+        ei = physics.bending_stiffness * torch.as_tensor(body.bend_scale / bend_lengths(body))
+        total = total + (2.0 * ei * (1 - cosine) / (1 + cosine)).sum()
+    return float(total)
+
+
+def test_free_fall_is_the_discrete_sum() -> None:
+    # Semi-implicit Euler after n substeps: v = g n h, z = g h^2 n (n + 1) / 2.
+    body = particles(np.zeros((2, 3)) + [[0, 0, 0], [1, 0, 0]])
+    sim = SpringMass(body, Physics(), substeps=10)
+    x, after = run(sim, state_of(body.rest_position), 20)
+    n, h = 200, 0.001  # 200 roundings of 6e-8 at most
+    assert float(x[-1, 0, 2]) == pytest.approx(-G * h * h * n * (n + 1) / 2, rel=1.2e-5)
+    assert float(after.velocity[0, 2]) == pytest.approx(-G * n * h, rel=1.2e-5)
+
+
+def test_pendulum_period() -> None:
+    # T = 2 pi sqrt(L/g) (1 + a^2/16) = 2.00641 s for L = 1 m, a = 0.1 rad.
+    body = particles(np.array([[0.0, 0, 0], [0, 0, -1.0]]))
+    body = dataclasses.replace(body, springs=np.array([[0, 1]], np.int32), rest_length=np.ones(1),
+                               stiffness_scale=np.ones(1), damping_scale=np.ones(1))  # fmt: skip
+    sim = SpringMass(body, Physics(stiffness=3000.0, damping=1.0))
+    swung = state_of(np.array([[0.0, 0, 0], [math.sin(0.1), 0, -math.cos(0.1)]]))
+    grips = still(torch.zeros(1, 3), 420)
+    x = sim.rollout(sim.start(holding(swung, {0: 0}), still(torch.zeros(1, 3))), grips)[:, 1, 0].numpy()
+    down = np.flatnonzero((x[:-1] > 0) & (x[1:] <= 0))
+    at = [0.01 * (n + x[n] / (x[n] - x[n + 1])) for n in down]
+    # The weight stretches the spring by m g / k = 0.03 %; linear interpolation of the crossing is finer.
+    assert at[1] - at[0] == pytest.approx(2 * math.pi * math.sqrt(1 / G) * (1 + 0.01 / 16), rel=1e-3)
+
+
+def test_momentum_is_kept_without_gravity() -> None:
+    rng = np.random.default_rng(0)
+    body = blob(rng)
+    assert len(body.bends)
+    sim = SpringMass(body, Physics(stiffness=60.0, damping=0.2, bending_stiffness=1e-3), NOWHERE)
+    state = state_of(body.rest_position, rng.normal(size=(40, 3)) * 0.5)
+    _, after = run(sim, state, 30)
+    m = torch.as_tensor(body.mass)[:, None]
+    for quantity in (
+        lambda s: (m * s.velocity.double()).sum(0),
+        lambda s: (m * torch.linalg.cross(s.position.double(), s.velocity.double())).sum(0),
+    ):
+        # 30 x substeps roundings of 1e-7 each that add like a random walk, far below 1e-5 of the first value.
+        assert float((quantity(after) - quantity(state)).norm() / quantity(state).norm()) < 1e-5
+
+
+@pytest.mark.parametrize("kind", ["blob", "line"])
+def test_energy_never_grows(kind: str) -> None:
+    rng = np.random.default_rng(1)
+    body = blob(rng) if kind == "blob" else line(mass=0.2)
+    physics = Physics(stiffness=60.0, damping=0.05, bending_stiffness=0.0 if kind == "blob" else 5e-3)
+    chosen = SpringMass(body, physics, NOWHERE).substeps
+    sim = SpringMass(body, physics, NOWHERE, substeps=8 * chosen)
+    state = sim.start(state_of(body.rest_position, rng.normal(size=(body.count, 3)) * 0.5))
+    levels = [energy(body, physics, state)]
+    for _ in range(60):
+        state = sim.step(state, nobody())
+        levels.append(energy(body, physics, state))
+    # A symplectic step keeps a shadow energy that differs by O(h w) = a percent or so of what is stored.
+    assert max(np.diff(levels)) < 0.01 * levels[0]
+    assert levels[-1] < 0.9 * levels[0]
+
+
+def test_contact_adds_no_energy() -> None:
+    body = line(mass=0.2, radius=0.004)
+    physics = Physics(stiffness=60.0, damping=0.05, bending_stiffness=5e-3, ground_friction=0.4)
+    sim = SpringMass(body, physics, Scene(ground=0.0), substeps=60)
+    dropped = body.rest_position @ rotation_about_z(torch.tensor(0.3)).double().numpy().T + [0, 0, 0.1]
+    dropped[:, 2] += 0.02 * np.sin(np.arange(12))
+    state = sim.start(state_of(dropped))
+    levels = []
+    for _ in range(100):
+        levels.append(energy(body, physics, state) + G * float((torch.as_tensor(body.mass) * state.position[:, 2]).sum()))
+        state = sim.step(state, nobody())
+    assert max(np.diff(levels)) < 0.01 * levels[0]
+    assert float(state.velocity.norm(dim=-1).max()) < 0.05  # and the line has come to rest
+    assert float(state.position[:, 2].min()) >= 0.004 - 1e-6
+
+
+@pytest.mark.parametrize("ratio", [0.9, 1.1])
+def test_sliding_on_an_incline_stops_above_the_friction_angle(ratio: float) -> None:
+    angle, mu = 0.5, ratio * math.tan(0.5)
+    gravity = (G * math.sin(angle), 0.0, -G * math.cos(angle))
+    body = particles(np.array([[0.0, 0, 0], [0.0, 1, 0]]))
+    sim = SpringMass(body, Physics(ground_friction=mu), Scene(gravity=gravity, ground=0.0))
+    x, after = run(sim, state_of(body.rest_position, np.array([0.1, 0, 0])), 60)
+    pull = gravity[0] - mu * G * math.cos(angle)  # -+0.470 m/s^2
+    if ratio > 1:  # stops after v0 / 0.470 = 0.213 s, v0^2 / (2 0.470) = 1.06 cm down
+        assert float(after.velocity.abs().max()) < 1e-6
+        assert float(x[-1, 0, 0]) == pytest.approx(0.01 / (2 * -pull), rel=0.05)
+    else:
+        assert float(after.velocity[0, 0]) == pytest.approx(0.1 + pull * 0.6, rel=1e-3)
+
+
+def test_hanging_chain_is_a_catenary() -> None:
+    count, span, length = 41, 1.0, 1.3
+    a = brentq(lambda a: 2 * a * math.sinh(span / (2 * a)) - length, 0.1, 10)
+    s = np.linspace(-length / 2, length / 2, count)
+    curve = np.stack((a * np.arcsinh(s / a), 0 * s, np.sqrt(a * a + s * s)), axis=1)
+    body = line(count, length, mass=0.1, connection_threshold=1.5 * length / 40)
+    drag = LIBRARY["drag_linear"].extension(coefficient=5.0)
+    sim = SpringMass(body, Physics(stiffness=300.0, damping=0.2), extensions=[drag])
+    begin = curve.copy()
+    begin[1:-1, 2] += 0.1 * np.sin(np.arange(39))  # far from it
+    ends = curve[[0, -1]]
+    state = sim.start(holding(state_of(begin), {0: 0, 40: 1}), still(ends))
+    x = sim.rollout(state, still(ends, 400))[-1].numpy()
+    # Stretch: at most the end's tension / stiffness = 0.9 N / 300 N; 40 pieces: 1e-3 of the sag. Together 0.5 % of L.
+    assert np.abs(x - curve).max() < 0.005 * length
+
+
+def test_cantilever_deflects_as_euler_bernoulli_says() -> None:
+    # Point loads m g at s: sum m g s^2 (3 L - s) / (6 EI); a tip load alone gives F L^3 / (3 EI).
+    count, ei = 21, 0.4
+    body = line(count, 0.525, mass=0.02, connection_threshold=0.04)
+    mass = body.mass.copy()
+    mass[-1] = 0.02
+    body = dataclasses.replace(body, mass=mass)
+    # The held edge 0-1 is the clamp. The bend at particle 1 stands for half an edge either side: it begins mid-edge.
+    s = body.rest_position[1:, 0] - body.rest_position[:2, 0].mean()
+    expected = float((mass[1:] * G * s**2 * (3 * s[-1] - s)).sum() / (6 * ei))
+    damping = LIBRARY["drag_linear"].extension(coefficient=8.0)
+    sim = SpringMass(body, Physics(stiffness=100.0, damping=0.05, bending_stiffness=ei), extensions=[damping])
+    ends = body.rest_position[:1]
+    state = sim.start(holding(state_of(body.rest_position), {0: 0, 1: 0}), still(ends))
+    x = sim.rollout(state, still(ends, 300))[-1]
+    # Small-deflection theory: 5 % of L deflects, of which (5 %)^2 and 1/20^2 are neglected.
+    assert 0.01 * s[-1] < expected < 0.15 * s[-1]
+    assert -float(x[-1, 2]) == pytest.approx(expected, rel=0.01)
+
+
+def test_turning_everything_about_gravity_turns_the_result() -> None:
+    rng = np.random.default_rng(2)
+    body = blob(rng)
+    sim = SpringMass(body, Physics(stiffness=60.0, damping=0.2, bending_stiffness=1e-3), Scene(ground=-0.12))
+    turn = rotation_about_z(torch.tensor(1.1, dtype=torch.float64)).numpy()
+    v = rng.normal(size=(40, 3)) * 0.3
+    first = torch.tensor(body.rest_position[:1], dtype=torch.float32)
+    ways = []
+    for rotate in (np.eye(3), turn):
+        r = torch.tensor(rotate, dtype=torch.float32)
+        state = holding(state_of(body.rest_position @ rotate.T, v @ rotate.T), {0: 0})
+        way = torch.linspace(0, 0.1, 20)[:, None, None] * torch.tensor([1.0, 0.5, 0.2])
+        grips = still(first @ r.T, 20)
+        grips = Grip(grips.position + way @ r.T, grips.rotation, grips.closed)
+        ways.append(sim.rollout(sim.start(state, still(first @ r.T)), grips) @ r)
+    assert float((ways[0] - ways[1]).abs().max()) < 2e-5  # float32 roundings of another set of numbers
+
+
+@pytest.mark.parametrize(("stiffness", "damping", "bending"), [(1e5, 1e-6, 0.0), (0.1, 100.0, 0.0), (1e5, 100.0, 0.0),
+                                                              (0.1, 1e-6, 10.0)])  # fmt: skip
+def test_chosen_substeps_are_stable_and_not_wasteful(stiffness: float, damping: float, bending: float) -> None:
+    body = line(8, 0.7, mass=8.0)
+    physics = Physics(stiffness=stiffness, damping=damping, bending_stiffness=bending)
+    rng = np.random.default_rng(4)
+    state = state_of(body.rest_position, rng.normal(size=(8, 3)) * 0.01)
+    sim = SpringMass(body, physics, NOWHERE, diverged_as_nan=True)
+    _, after = run(sim, state, 30)
+    assert float(after.velocity.abs().max()) < 0.1  # no more than it began with
+    coarse = SpringMass(body, physics, NOWHERE, substeps=max(sim.substeps // 3, 1), diverged_as_nan=True)
+    _, after = run(coarse, state, 30)
+    assert not float(after.velocity.abs().max()) < 1.0
