@@ -108,7 +108,8 @@ def test_contact_adds_no_energy() -> None:
     state = sim.start(state_of(dropped))
     levels = []
     for _ in range(100):
-        levels.append(energy(body, physics, state) + G * float((torch.as_tensor(body.mass) * state.position[:, 2]).sum()))
+        height = float((torch.as_tensor(body.mass) * state.position[:, 2]).sum())
+        levels.append(energy(body, physics, state) + G * height)
         state = sim.step(state, nobody())
     assert max(np.diff(levels)) < 0.01 * levels[0]
     assert float(state.velocity.norm(dim=-1).max()) < 0.05  # and the line has come to rest

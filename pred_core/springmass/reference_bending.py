@@ -63,7 +63,8 @@ def _moments(
         ends = held[:, int(bends[begin, 0])], held[:, int(bends[end - 1, 2])]
         line = slice(begin, end)
         was = None if memory.curvature is None else memory.curvature[:, line]
-        u, twist = _start_frame(number, a[:, line], b[:, line], curvature[:, line], ends, rotation, memory, was, _end_twist(sim))
+        shape = a[:, line], b[:, line], curvature[:, line]
+        u, twist = _start_frame(number, *shape, ends, rotation, memory, was, _end_twist(sim))
         memory.director[number], memory.twist[number] = u, twist
         d1[:, line], d2[:, line] = _directors(u, a[:, line], b[:, line], twist[:, None] * sim.bend_rows[line, 3])
     now = torch.stack((_dot(curvature, d1)[..., 0], _dot(curvature, d2)[..., 0]), -1)

@@ -1,0 +1,211 @@
+"""What every effect of the library promises, and what each law does. New effects are covered by the first tests."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from springmass_cases import NOWHERE, holding, line, nobody, particles, state_of, still
+from torch import Tensor
+
+from pred_core.effects import LIBRARY
+from pred_core.effects.algebra import Code, Traced, Vec3, where
+from pred_core.effects.effect import HOOKS, BendContext, Effect
+from pred_core.errors import TwinError
+from pred_core.frames import quaternion_from_rotation_vector
+from pred_core.springmass import SpringMass
+from pred_core.twin import Extension
+from pred_core.types import Grip, Physics, Scene, State
+
+PHYSICS = Physics(stiffness=60.0, damping=0.1, ground_friction=0.4, bending_stiffness=2e-4)
+INTERNAL = ("bending_damping", "bending_hysteresis")
+simulated = pytest.mark.parametrize("effect", [e for e in LIBRARY.values() if set(e.hooks) - {"observe"}],
+                                    ids=lambda e: e.id)  # fmt: skip
+
+
+def swung(worlds: int, extensions: tuple[Extension, ...], substeps: int | None = None) -> Tensor:
+    """Trajectories of a held line that swings, turns with its gripper and touches the ground."""
+    rng = np.random.default_rng(0)
+    body = line(radius=0.003)
+    sim = SpringMass(body, PHYSICS, Scene(ground=-0.02), extensions=extensions, substeps=substeps)
+    flung = state_of(np.stack([body.rest_position] * worlds), rng.normal(size=(worlds, 12, 3)) * 0.3)
+    state = holding(flung, {0: 0, 1: 0})
+    turn = quaternion_from_rotation_vector(torch.linspace(0.05, 1, 20)[:, None, None] * torch.tensor([0.3, 0.5, -0.4]))
+    place = torch.linspace(0.05, 1, 20)[:, None, None] * torch.tensor([0.05, -0.1, 0.02])
+    grips = Grip(place, turn, torch.ones(20, 1, dtype=torch.bool))
+    return sim.rollout(sim.start(state, still(torch.zeros(worlds, 1, 3))), grips)
+
+
+@simulated
+def test_null_values_reproduce_the_base_bit_for_bit(effect: type[Effect]) -> None:
+    null = effect.extension()
+    effect.check(null)
+    for worlds in (1, 3):
+        assert torch.equal(swung(worlds, (null,)), swung(worlds, ()))
+
+
+@simulated
+def test_other_values_change_the_motion_and_stay_finite(effect: type[Effect]) -> None:
+    base = swung(3, ())
+    for q in effect.parameters:
+        away = q.high if not math.isfinite(q.typical) else q.null + q.typical
+        away = away if q.low <= away <= q.high else q.null - q.typical
+        values: dict[str, float | tuple[float, ...]] = {
+            o.name: (min(max(o.null + o.typical, o.low), o.high),) * o.size for o in effect.parameters
+        }
+        values[q.name] = (away,) * q.size
+        changed = swung(3, (effect.extension(**values),))
+        assert torch.isfinite(changed).all()
+        assert float((changed - base).abs().max()) > 1e-7, q.name
+
+
+@pytest.mark.parametrize("effect", LIBRARY.values(), ids=lambda e: e.id)
+def test_declaration_is_complete_and_bounds_hold(effect: type[Effect]) -> None:
+    assert LIBRARY[effect.id] is effect and effect.__doc__ and effect.family
+    assert effect.hooks and set(effect.hooks) <= set(HOOKS)
+    for q in effect.parameters:
+        assert q.low < q.high and q.unit and q.doc
+        for value in (q.high * 1.01 + 1e-6, q.low - abs(q.low) * 0.01 - 1e-6, math.nan, math.inf):
+            if value == q.null:
+                continue
+            bad = effect.null() | {q.name: (value,) + (q.null,) * (q.size - 1)}
+            with pytest.raises(TwinError, match=q.name):
+                effect.check(Extension(effect.id, effect.version, bad))
+        with pytest.raises(TwinError, match=q.name):
+            effect.check(Extension(effect.id, effect.version, effect.null() | {q.name: (q.null,) * (q.size + 1)}))
+    with pytest.raises(TwinError, match="no parameter"):
+        effect.extension(nonsense=1.0)
+    with pytest.raises(TwinError, match="version"):
+        effect.check(Extension(effect.id, effect.version + 1, effect.null()))
+
+
+def test_drag_gives_terminal_velocity() -> None:
+    # b = 5 /s: v = g/b = 1.962 m/s, whatever the mass; the discrete fixed point is the same.
+    body = dataclasses.replace(particles(np.array([[0.0, 0, 0], [1, 0, 0]])), mass=np.array([0.01, 1.0]))
+    sim = SpringMass(body, PHYSICS, extensions=[LIBRARY["drag_linear"].extension(coefficient=5.0)], substeps=10)
+    _, after = sim.rollout_states(sim.start(state_of(body.rest_position)), nobody(400))
+    assert after.velocity[:, 2].tolist() == pytest.approx([-1.962, -1.962], rel=1e-5)
+
+
+def test_gravity_offset_is_tilted_gravity() -> None:
+    body = line()
+    offset = LIBRARY["gravity_offset"].extension(acceleration=(1.0, -2.0, 0.5))
+    state = state_of(body.rest_position, np.random.default_rng(0).normal(size=(12, 3)) * 0.1)
+    ways = []
+    for scene, extensions in ((Scene(), [offset]), (Scene(gravity=(1.0, -2.0, -9.31)), [])):
+        sim = SpringMass(body, PHYSICS, scene, extensions=extensions, substeps=20)
+        ways.append(sim.rollout(sim.start(state), nobody(20)))
+    assert float((ways[0] - ways[1]).abs().max()) < 1e-6
+
+
+def motion(body: object, state: State) -> tuple[float, Tensor, Tensor]:
+    """Kinetic energy, momentum, angular momentum."""
+    m = torch.as_tensor(body.mass)[:, None]  # type: ignore[attr-defined]
+    x, v = state.position.double(), state.velocity.double()
+    return float((0.5 * m * v * v).sum()), (m * v).sum(0), (m * torch.linalg.cross(x, v)).sum(0)
+
+
+def arc(count: int, radius: float, angle: float) -> np.ndarray:
+    a = np.linspace(0, angle, count)
+    return np.stack((radius * np.sin(a), radius * np.cos(a), 0 * a), axis=1)
+
+
+@pytest.mark.parametrize("axis", [(0.0, 0.0, 6.0), (4.0, 1.0, 0.0)])
+def test_bending_damping_does_nothing_in_rigid_motion(axis: tuple[float, ...]) -> None:
+    # A curved free rod without bending moments would fly apart; stiff springs across keep its shape while it turns.
+    shape = arc(12, 0.2, 2.0)
+    shape -= shape.mean(0)
+    body = line()
+    pairs = np.array([(i, j) for i in range(12) for j in range(i + 1, 12)], np.int32)
+    length = np.linalg.norm(shape[pairs[:, 1]] - shape[pairs[:, 0]], axis=1)
+    ones = np.ones(len(pairs))
+    body = dataclasses.replace(body, rest_position=shape, springs=pairs, rest_length=length, stiffness_scale=ones,
+                               damping_scale=0 * ones)  # fmt: skip
+    spin = np.cross(np.array(axis), shape)
+    kept = []
+    for time in (0.0, 0.5):
+        sim = SpringMass(body, Physics(stiffness=200.0, bending_stiffness=1e-4), NOWHERE, substeps=200,
+                         extensions=[LIBRARY["bending_damping"].extension(time=time)])  # fmt: skip
+        start = sim.start(state_of(shape, spin))
+        _, after = sim.rollout_states(start, nobody(60))
+        kept.append(motion(body, after)[0] / motion(body, start)[0])
+    # It turns by two radians or more; a frame that does not turn with the rod would lose most of the energy.
+    assert kept[1] == pytest.approx(kept[0], abs=0.02)
+    assert kept[1] > 0.9
+
+
+@pytest.mark.parametrize("id", INTERNAL)
+def test_internal_effects_keep_momentum(id: str) -> None:
+    body = line()
+    typical = {"bending_damping": {"time": 0.02}, "bending_hysteresis": {"ratio": 2.0, "reach": 0.1}}[id]
+    sim = SpringMass(body, PHYSICS, NOWHERE, extensions=[LIBRARY[id].extension(**typical)])
+    flat = np.random.default_rng(0).normal(size=(12, 3)) * [1.0, 1.0, 0.0] * 0.3  # plane: moments along one axis
+    start = sim.start(state_of(body.rest_position, flat))
+    _, after = sim.rollout_states(start, nobody(30))
+    _, p0, l0 = motion(body, start)
+    _, p1, l1 = motion(body, after)
+    assert float((p1 - p0).norm() / p0.norm()) < 1e-5
+    assert float((l1 - l0).norm() / l0.norm()) < 1e-4  # the frame's arctangent is good to 1e-5
+    # Out of the plane the frame transmits torsion without inertia: linear momentum only.
+    start = sim.start(state_of(body.rest_position, np.random.default_rng(1).normal(size=(12, 3)) * 0.3))
+    _, after = sim.rollout_states(start, nobody(30))
+    assert float((motion(body, after)[1] - motion(body, start)[1]).norm()) < 1e-5
+
+
+@pytest.mark.parametrize("seconds", [0.5, 2.0])
+def test_hysteresis_dissipates_at_any_speed_and_leaves_a_set(seconds: float) -> None:
+    """The law alone, on tensors: bent and straightened again, slowly or fast."""
+    effect = LIBRARY["bending_hysteresis"]
+    # Curvature goes 0 -> 0.3 -> 0 in n steps; dz = dk - |dk| z / c.
+    n = round(seconds * 200)
+    z, work = (torch.zeros(()), torch.zeros(())), 0.0
+    p = {"ratio": (torch.tensor(2.0),), "reach": (torch.tensor(0.05),)}
+    last = 0.0
+    for k in [*np.linspace(0, 0.3, n)[1:], *np.linspace(0.3, 0, n)[1:]]:
+        step = torch.tensor(k - last)
+        zero = torch.zeros(())
+        at = BendContext((torch.tensor(k), zero), (step, zero), torch.tensor(1.0), torch.tensor(1.0),
+                         torch.tensor(1e-3), torch.tensor(0.5), z)  # fmt: skip
+        m1, _, z = effect.bend(p, at)
+        work += float(m1 * step)
+        last = float(k)
+    # Dahl, loading to saturation and back: z = c tanh-like exponential; the loop's area is 2 a c (0.3 - 2 c) to O(c^2).
+    assert work == pytest.approx(2 * 2.0 * 0.05 * (0.3 - 0.05 * (1 + math.log(2.0))), rel=0.1)
+    assert float(m1) < -0.09  # a c = 0.1 N m against straightening again: the permanent set
+
+
+def test_hysteresis_leaves_a_bent_line_bent() -> None:
+    """A line bent by gravity, then freed of it, keeps part of its bend only with hysteresis."""
+    body = line(mass=0.02)
+    sag = {}
+    for ratio in (0.0, 4.0):
+        extensions = [LIBRARY["bending_hysteresis"].extension(ratio=ratio, reach=0.02),
+                      LIBRARY["drag_linear"].extension(coefficient=6.0)]  # fmt: skip
+        physics = Physics(stiffness=60.0, damping=0.1, bending_stiffness=2e-3)
+        clamp = still(torch.zeros(1, 3))
+        loaded = SpringMass(body, physics, Scene(), extensions=extensions)
+        state = loaded.start(holding(state_of(body.rest_position), {0: 0, 1: 0}), clamp)
+        _, state = loaded.rollout_states(state, still(torch.zeros(1, 3), 400))
+        bent = -float(state.position[-1, 2])
+        free = SpringMass(body, physics, NOWHERE, extensions=extensions, substeps=loaded.substeps)
+        x, _ = free.rollout_states(state, still(torch.zeros(1, 3), 600))
+        sag[ratio] = -float(x[-1, -1, 2]) / bent
+    assert abs(sag[0.0]) < 0.02
+    assert sag[4.0] > 0.05
+
+
+def test_algebra_writes_and_computes_the_same() -> None:
+    def law(a: object, b: object) -> object:
+        v = Vec3(a, b, 1.0) * 2.0
+        return where(a > 0.5, v.dot(v.cross(Vec3(1.0, a, b))) - 3.0 / b, -v.norm())  # type: ignore[operator]
+
+    code = Code("t")
+    assert isinstance(law(Traced(code, "a"), Traced(code, "b")), Traced)
+    assert all(line.startswith("const ") for line in code.lines)
+    # By hand for a = 1, b = 2: v = (2, 4, 2), cross (1, 1, 2) = (6, -2, -2), dot = 0, minus 3 / 2.
+    assert float(law(torch.tensor(1.0), torch.tensor(2.0))) == pytest.approx(-1.5)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="traced"):
+        Traced(code, "a") + torch.tensor(1.0)
