@@ -100,7 +100,7 @@ def deform_episode(source: DeformSource, index: int) -> Episode:
     tracks = Tracks(stamps, position, np.arange(count, dtype=np.uint32), seen, seen.astype(np.float32))
     grips = Grip(
         position=torch.as_tensor(position[:, list(source.held)], dtype=torch.float32),
-        rotation=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(frames, len(source.held), 1),  # not measured
+        rotation=torch.as_tensor(clamp_rotation(position), dtype=torch.float32),
         closed=torch.ones(frames, len(source.held), dtype=torch.bool),
     )
     return Episode(
@@ -113,6 +113,23 @@ def deform_episode(source: DeformSource, index: int) -> Episode:
         split=source.split[index],
         recording=source.recording[index],
     )
+
+
+def clamp_rotation(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gripper rotations (T, 4, 4) wxyz from positions (T, V, 3): the source measured only the clamped markers.
+
+    Each clamp is taken to be turned by the smallest rotation that takes the vertical to its clamped edge: the first
+    edge enters pointing down (-z), the last leaves pointing up (+z). Rotation about the edge itself is unknown.
+    """
+    rotations = []
+    for a, b, vertical in ((0, 1, -1.0), (-2, -1, 1.0)):
+        edge = position[:, b] - position[:, a]
+        edge = edge / np.linalg.norm(edge, axis=1, keepdims=True)
+        axis = np.cross(np.array([0.0, 0.0, vertical]), edge)
+        rotation = np.concatenate((1.0 + vertical * edge[:, 2:], axis), axis=1)
+        rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+        rotations += [rotation, rotation]
+    return np.stack(rotations, axis=1)
 
 
 def group_recordings(position: tuple[NDArray[np.float64], ...]) -> tuple[int, ...]:
