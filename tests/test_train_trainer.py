@@ -19,7 +19,7 @@ from pred_core.residual import ResidualConfig
 from pred_core.train import Trainer, TrainingConfig, align
 from pred_core.train.checkpoint import load_checkpoint, save_checkpoint
 from pred_core.train.report import write_report
-from pred_core.train.rollout import random_azimuth
+from pred_core.train.rollout import _loss, random_azimuth
 from pred_core.train.run import run_training
 from pred_core.types import State
 
@@ -165,6 +165,14 @@ def test_carried_windows_follow_each_other_on_own_predictions() -> None:
     assert seen[first : first + 6] == [4, 7, 10, 4, 7, 10]
     assert set(run.slots.place[:, 1].tolist()) <= {4, 7, 10}
     assert run.slots.state.memory["residual/count"].min() >= 3  # the window of estimates is carried too
+
+
+def test_losses_by_hand() -> None:
+    # Errors 0.1 and -2 mm, beta 0.3: square 0.01 + 4; absolute 2.1; smooth 0.01 / 0.6 + (2 - 0.15).
+    error = torch.tensor([0.1, -2.0])
+    expected = {"square": 4.01, "absolute": 2.1, "smooth": 0.01 / 0.6 + 1.85}
+    for name, value in expected.items():
+        assert float(_loss(error, dataclasses.replace(QUICK, loss=name))) == pytest.approx(value, rel=1e-6)
 
 
 def test_azimuth_turns_about_gravity() -> None:

@@ -17,7 +17,10 @@ class TrainingConfig:
     learning_rate: float = setting(1e-3, low=1e-7, high=1.0, doc="Adam, cosine to zero (paper's code: 1e-4)")
     clip: float = setting(1.0, low=1e-6, high=1e6, doc="largest gradient norm")
     penalty: float = setting(0.01, unit="mm^2", low=0.0, high=1e6, doc="on the mean square of residual / cap")
-    loss: str = setting("square", choices=("square", "absolute"), doc="of the position error [mm]")
+    loss: str = setting(
+        "square", choices=("square", "absolute", "smooth"), doc="of the position error [mm]; smooth: absolute beyond beta"
+    )
+    beta: float = setting(0.3, unit="mm", low=1e-6, high=1e6, doc="where a smooth loss turns from square to absolute")
     gradient: str = setting(
         "detached",
         choices=("detached", "ballistic", "differences"),

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from pred_core.errors import DivergenceError
 from pred_core.frames import quaternion_from_rotation_vector, quaternion_to_matrix
@@ -74,7 +75,7 @@ def training_rollout(model: PReD, state: State, batch: Batch, config: TrainingCo
         step = model.advance(state, batch.grips.at(k))
         arrived = _arrived(model, state, step, batch.grips.at(k), config.gradient)
         error = (arrived.position - batch.target[k]) * batch.seen[k].unsqueeze(-1) * MILLIMETRE
-        total = total + (error.square() if config.loss == "square" else error.abs()).sum()
+        total = total + _loss(error, config)
         penalty = penalty + (step.residual / model.network.config.cap).square().mean()
         absolute += error.detach().abs().sum()
         binding += binding_share(step.residual.detach(), step.state.held < 0, model.network.config.cap)
@@ -97,6 +98,15 @@ def held_out_error(model: PReD, batch: Batch) -> Outcome:
     if not bool(torch.isfinite(error)):
         raise DivergenceError("a held-out rollout left the finite numbers", next_step="Lower --cap or --learning-rate")
     return Outcome(error, float(error), float(binding / len(batch.target)), state)
+
+
+def _loss(error: Tensor, config: TrainingConfig) -> Tensor:
+    """Sum over an error [mm] of any shape; `smooth` is square / (2 beta) within beta and has slope 1 beyond."""
+    if config.loss == "square":
+        return error.square().sum()
+    if config.loss == "absolute":
+        return error.abs().sum()
+    return functional.smooth_l1_loss(error, torch.zeros_like(error), reduction="sum", beta=config.beta)
 
 
 def _detached(state: State) -> State:
