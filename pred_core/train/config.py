@@ -18,7 +18,7 @@ class TrainingConfig:
     clip: float = setting(1.0, low=1e-6, high=1e6, doc="largest gradient norm")
     penalty: float = setting(0.01, unit="mm^2", low=0.0, high=1e6, doc="on the mean square of residual / cap")
     loss: str = setting(
-        "square", choices=("square", "absolute", "smooth"), doc="of the position error [mm]; smooth: absolute beyond beta"
+        "square", choices=("square", "absolute", "smooth"), doc="of position errors [mm]; smooth: absolute beyond beta"
     )
     beta: float = setting(0.3, unit="mm", low=1e-6, high=1e6, doc="where a smooth loss turns from square to absolute")
     gradient: str = setting(
