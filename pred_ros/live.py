@@ -81,21 +81,23 @@ def _media_seconds(clips: list[Clip], dataset: Path) -> float:
 def _follow(children: Children, limit: float, terminal: TextIO) -> None:
     """Show one line until the evaluator is done. Raises: PredError."""
     begin = time.monotonic()
-    finished_player: float | None = None
+    told = ""
     try:
         while children.running["evaluator"].poll() is None:
             elapsed = time.monotonic() - begin
             for name, process in children.running.items():
                 if process.poll() not in (None, 0):
                     raise PredError(f"the {name} ended with code {process.returncode}", got=children.last_line(name))
-            if finished_player is None and children.running["player"].poll() == 0:
-                finished_player = elapsed
             if elapsed > limit:
                 raise PredError(
                     f"the replay took longer than {limit:.0f} s and was ended",
                     got="; ".join(f"{n}: {children.last_line(n)}" for n in children.running),
                 )
-            _show(terminal, f"{elapsed:5.0f} s  {_said(children, 'player')}  |  {_said(children, 'evaluator')}")
+            playing = _said(children, "player")
+            _show(terminal, f"{elapsed:5.0f} s  {playing}  |  {_said(children, 'evaluator')}")
+            if not terminal.isatty() and playing != told:
+                told = playing
+                print(f"   {elapsed:5.0f} s  {playing}", file=terminal, flush=True)
             time.sleep(FOLLOW)
     finally:
         _show(terminal, "")

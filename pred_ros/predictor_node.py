@@ -34,6 +34,7 @@ from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.prediction import Predictor, Rules
 from pred_ros.shell import Shell
 
+KEPT = 8  # newest messages that survive an overload: four frames with their poses, enough for a start
 REFUSED_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
 
 
@@ -271,7 +272,7 @@ class PredictorNode(Shell):
 
     def _drop_to_newest(self) -> None:
         dropped = 0
-        while not self._inbox.empty():
+        while self._inbox.qsize() > KEPT:
             if self._inbox.get_nowait() is None:
                 self._stopping = True
                 return

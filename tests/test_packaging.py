@@ -92,3 +92,10 @@ def test_every_requirement_is_pinned_exactly(arguments: dict[str, Any]) -> None:
 def test_core_installs_without_ros_or_hardware(arguments: dict[str, Any]) -> None:
     core = " ".join(arguments["install_requires"])
     assert "ros-" not in core and "depthai" not in core and "ur-rtde" not in core and "mujoco" not in core
+
+
+def test_files_that_the_core_reads_are_installed_with_it(arguments: dict[str, Any]) -> None:
+    patterns = [p.removeprefix("**/") for p in arguments["package_data"]["pred_core"]]
+    files = [p for p in (ROOT / "pred_core").rglob("*") if p.is_file() and "__pycache__" not in p.parts]
+    for path in files:
+        assert path.suffix == ".py" or any(path.match(p) for p in patterns), path.relative_to(ROOT)

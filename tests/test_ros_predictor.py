@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from std_srvs.srv import Trigger
 from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
 from pred_core.twin import Twin
+from pred_core.types import Grip, State
 from pred_ros import convert
 from pred_ros.predictor_node import PredictorNode
 
@@ -201,6 +203,7 @@ def test_divergence_stops_before_the_wire_and_reset_starts_anew(twin: Path) -> N
         for frame in range(10):
             bench.feed(frame)
         bench.until(lambda: bench.says(ERROR, "diverged at stamp 7.050 s", "~/reset"), "an error with the stamp")
+        bench.until(lambda: len(bench.predictions) >= 3, "the predictions before it")
         assert len(bench.predictions) == 3  # frames 2, 3, 4; the fourth step was not finite
         assert all(np.isfinite(state.position.numpy()).all() for _, state in bench.predictions)
         bench.node._dynamics.left = 10**9
@@ -242,3 +245,42 @@ def test_twin_of_another_rate_is_said(tmp_path: Path, twin: Path) -> None:
             return bench.says(WARN, "frames come 0.01 s apart, the twin steps 0.0333333 s")
 
         bench.until(feed, "a warning that names both periods")
+
+
+def test_too_slow_drops_to_the_newest_data_and_says_so(twin: Path) -> None:
+    class Slow(Straight):
+        def step(self, state: State, grip: Grip) -> State:
+            time.sleep(0.02)  # twice the period
+            return super().step(state, grip)
+
+    class SlowPredictor(PredictorNode):
+        MAKE_DYNAMICS = staticmethod(lambda _: Slow())
+
+    parameters = {"twin": str(twin), "held": "'0:0'", "overload": "newest", "max_backlog": "0.1"}
+    with bench_of(SlowPredictor, parameters) as bench:
+        for frame in range(100):
+            bench.feed(frame)
+        bench.until(lambda: bench.says(WARN, "too slow", "messages dropped"), "a warning")
+        assert bench.node.diagnostics.counter("dropped messages") > 0
+        for frame in range(200, 206):
+            bench.feed(frame)
+        newest = START + 205 * STEP
+        bench.until(lambda: bench.predictions and bench.predictions[-1][0] == newest, "the newest data are predicted")
+        assert bench.predictions[-1][1].position[4, 0] == pytest.approx(0.2 + 0.005 * 205, abs=1e-5)
+
+
+def test_queue_keeps_every_message_however_slow(twin: Path) -> None:
+    class Slow(Straight):
+        def step(self, state: State, grip: Grip) -> State:
+            time.sleep(0.02)
+            return super().step(state, grip)
+
+    class SlowPredictor(PredictorNode):
+        MAKE_DYNAMICS = staticmethod(lambda _: Slow())
+
+    parameters = {"twin": str(twin), "held": "'0:0'", "overload": "queue", "max_backlog": "0.1"}
+    with bench_of(SlowPredictor, parameters) as bench:
+        for frame in range(60):
+            bench.feed(frame)
+        bench.until(lambda: len(bench.predictions) == 58, "all of them")
+        assert bench.node.diagnostics.counter("dropped messages") == 0
