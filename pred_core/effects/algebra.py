@@ -7,6 +7,7 @@ in which a `Lane` is one float on CUDA and sixteen worlds side by side in one SI
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -145,6 +146,22 @@ def cos(a: Any) -> Any:
     return a.code.emit(f"lane_cos({a.name})") if isinstance(a, Traced) else torch.cos(torch.as_tensor(a))
 
 
+def interpolate(values: Sequence[Any], place: Any) -> Any:
+    """Straight lines between `values` at places 0, 1/(K-1), ..., 1; `place` is the same in all worlds."""
+    first = values[0]
+    if isinstance(first, Traced):
+        return first.code.emit(f"lane_interpolate(&{first.name}, {len(values)}, {_unlaned(place.name)})")
+    stacked = torch.stack([torch.as_tensor(v, dtype=_dtype(place)) for v in values])
+    scaled = (torch.as_tensor(place) * (len(values) - 1)).clamp(0, len(values) - 1)
+    below = scaled.floor().long().clamp_max(len(values) - 2)
+    rest = scaled - below
+    if stacked.dim() == 1:
+        return stacked[below] * (1.0 - rest) + stacked[below + 1] * rest
+    rows = stacked.flatten(1).T  # (W, K)
+    index = below.expand(rows.shape[0], -1)
+    return rows.gather(1, index) * (1.0 - rest) + rows.gather(1, index + 1) * rest
+
+
 def where(condition: Any, a: Any, b: Any) -> Any:
     """`a` where the condition holds, else `b`, per world."""
     if isinstance(condition, Traced):
@@ -155,6 +172,13 @@ def where(condition: Any, a: Any, b: Any) -> Any:
 def maximum(a: Any, b: Any) -> Any:
     """The larger of two scalars, per world."""
     return where(a > b, a, b)
+
+
+def _unlaned(name: str) -> str:
+    """The float inside `Lane(...)`: a place is not a lane of worlds."""
+    if not (name.startswith("Lane(") and name.endswith(")")):
+        raise TypeError("interpolate needs the place itself, not an expression of it")
+    return name[5:-1]
 
 
 def _dtype(*values: Any) -> torch.dtype:

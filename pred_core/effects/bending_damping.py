@@ -24,4 +24,4 @@ class BendingDamping(Effect):
 
     @classmethod
     def bend_bound(cls, p: Mapping[str, Any]) -> tuple[float, float]:
-        return 0.0, float(p["time"])
+        return 0.0, p["time"][0]

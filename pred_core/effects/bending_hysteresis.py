@@ -36,4 +36,4 @@ class BendingHysteresis(Effect):
 
     @classmethod
     def bend_bound(cls, p: Mapping[str, Any]) -> tuple[float, float]:
-        return float(p["ratio"]), 0.0
+        return p["ratio"][0], 0.0

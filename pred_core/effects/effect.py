@@ -16,7 +16,7 @@ from pred_core.effects.algebra import Vec3
 from pred_core.errors import TwinError, nearest
 from pred_core.twin import Extension
 
-HOOKS = ("boundary", "inertia", "spring", "bend", "contact", "force", "observe")
+HOOKS = ("boundary", "inertia", "spring", "bend", "bend_stiffness", "contact", "force", "observe")
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,13 @@ class Effect:
         raise AttributeError(f"{cls.id} has no bend hook")
 
     @classmethod
+    def bend_stiffness(cls, p: Mapping[str, Any], arc: Any) -> Any:
+        """Relative bending stiffness added, EI (1 + this), at material coordinate `arc`."""
+        raise AttributeError(f"{cls.id} has no bend_stiffness hook")
+
+    @classmethod
     def bend_bound(cls, p: Mapping[str, Any]) -> tuple[float, float]:
-        """(relative stiffness added, damping time [s]) of a bend; `p` holds first components. For the substeps."""
+        """(relative stiffness added, damping time [s]) of a bend at most; for the choice of substeps."""
         return 0.0, 0.0
 
     @classmethod

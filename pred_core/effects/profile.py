@@ -1,19 +1,19 @@
-"""Smooth profiles over the material coordinate, as Legendre series on 0..1."""
+"""Profiles over the material coordinate: straight lines between values at evenly spaced knots.
+
+Local knots, not polynomials: neighbouring values are free of each other, which conditions an identification better
+than a series of high order.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
-TERMS = 12  # coefficients of a profile; leave the high ones at zero for a smoother one
+from pred_core.effects.algebra import interpolate
+
+KNOTS = 12  # values of a profile, at arc 0, 1/11, ..., 1
 
 
-def legendre(coefficients: Sequence[Any], arc: Any) -> Any:
-    """sum_k c_k P_k(2 arc - 1), by the three-term recurrence (k+1) P_k+1 = (2k+1) x P_k - k P_k-1."""
-    x = 2.0 * arc - 1.0
-    before, now = 1.0, x
-    total = coefficients[0] + coefficients[1] * x
-    for k in range(1, len(coefficients) - 1):
-        before, now = now, (2 * k + 1) / (k + 1) * (x * now) - k / (k + 1) * before
-        total = total + coefficients[k + 1] * now
-    return total
+def profile(values: Sequence[Any], arc: Any) -> Any:
+    """Linear interpolation of `values` (KNOTS,) at the material coordinate `arc` in 0..1."""
+    return interpolate(values, arc)

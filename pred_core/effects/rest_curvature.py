@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from pred_core.effects.effect import BendContext, Effect, Parameter
-from pred_core.effects.profile import TERMS, legendre
+from pred_core.effects.profile import KNOTS, profile
 
 
 class RestCurvature(Effect):
     """M = -(EI/l) k0(s): the bending moment vanishes at k0, not at zero.
 
-    k0 has two components in the material frame, each a Legendre series over the arc length. Lengths of cable
+    k0 has two components in the material frame, each a profile over the arc length. Lengths of cable
     come off a drum curved; the set is fixed in the material and turns with the gripper.
     """
 
@@ -20,8 +20,8 @@ class RestCurvature(Effect):
     family = "bending"
     hooks = ("bend",)
     parameters = (
-        Parameter("first", "1", -1.0, 1.0, size=TERMS, typical=0.05, doc="k0 along the first axis, Legendre"),
-        Parameter("second", "1", -1.0, 1.0, size=TERMS, typical=0.05, doc="k0 along the second axis, Legendre"),
+        Parameter("first", "1", -1.0, 1.0, size=KNOTS, typical=0.05, doc="k0 along the first axis, at knots"),
+        Parameter("second", "1", -1.0, 1.0, size=KNOTS, typical=0.05, doc="k0 along the second axis, at knots"),
         Parameter(
             "twist", "rad", -4.0, 4.0, typical=0.3, starts=(-1.57, 1.57, 3.14),
             doc="angle of the material in the last gripper against the first, untwisted"
@@ -32,5 +32,5 @@ class RestCurvature(Effect):
 
     @classmethod
     def bend(cls, p: Mapping[str, Any], at: BendContext) -> tuple[Any, Any, tuple[Any, ...]]:
-        first, second = legendre(p["first"], at.arc), legendre(p["second"], at.arc)
+        first, second = profile(p["first"], at.arc), profile(p["second"], at.arc)
         return -(at.weight * first), -(at.weight * second), ()

@@ -17,7 +17,6 @@ class IdentifyConfig:
         (*PAPER, "bending_stiffness"), doc="fields of Physics that are searched; the first five are the paper's"
     )
     effects: tuple[str, ...] = setting((), doc="effects whose parameters are searched too")
-    terms: int = setting(4, low=1, high=12, doc="Legendre terms searched of a profile")
     restarts: int = setting(3, low=1, high=20, doc="CMA-ES runs, each with its own seed and start")
     evaluations: int = setting(400, low=20, high=100_000, doc="candidates per restart")
     window: float = setting(2.0, unit="s", low=0.05, high=600.0, doc="length of a window of the global search")

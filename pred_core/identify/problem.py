@@ -165,5 +165,5 @@ def _tile(values: Tensor, count: int) -> Tensor:
 
 
 def _bend_bound(candidate: Candidate) -> tuple[float, float]:
-    bounds = [find_effect(e.id).bend_bound({k: v[0] for k, v in e.parameters.items()}) for e in candidate.extensions]
+    bounds = [find_effect(e.id).bend_bound(e.parameters) for e in candidate.extensions]
     return sum(b[0] for b in bounds), sum(b[1] for b in bounds)

@@ -19,6 +19,7 @@ from pred_core.types import Array
 STEP = 0.05  # finite difference, in coordinates (twentieths of a typical change)
 SOFTNESS = 0.003  # [m] below which an error counts quadratically
 OUTLIER = 2.0  # times the median loss
+RIDGE = 1e-4  # of the mean curvature
 LONGEST_STEP = 3.0  # in coordinates, per iteration
 PATIENCE = 7  # times the damping is raised before giving up
 IMPROVEMENT = 5e-4  # relative, below which it has converged
@@ -93,7 +94,10 @@ def _normal_equations(
     jacobian = _jacobian(residuals, z, now, keep, lower, upper).reshape(len(z), -1)
     r = now[keep].reshape(-1)
     weighted = jacobian / np.sqrt(r**2 + SOFTNESS**2)
-    return (weighted @ jacobian.T).astype(np.float64) / len(r), (weighted @ r).astype(np.float64) / len(r)
+    normal = (weighted @ jacobian.T).astype(np.float64) / len(r)
+    # Directions that move nothing stay where they are: a floor far below what the data say of any useful one.
+    normal += RIDGE * np.trace(normal) / len(z) * np.eye(len(z))
+    return normal, (weighted @ r).astype(np.float64) / len(r)
 
 
 def _covariance(

@@ -19,7 +19,7 @@ from pred_core.identify.problem import Problem, draw_windows, make_windows
 from pred_core.identify.refine import Refined, refine
 from pred_core.identify.search import Journal, Restart, search, trimmed
 from pred_core.identify.sensitivity import sensitivities
-from pred_core.identify.space import Candidate, Knob, SearchSpace, search_space
+from pred_core.identify.space import Candidate, SearchSpace, search_space
 from pred_core.identify.starts import track_noise
 from pred_core.identify.topology import Topology
 from pred_core.train.recordings import Recording, align, split_groups
@@ -209,7 +209,7 @@ def _space(layout: Layout, config: IdentifyConfig) -> SearchSpace:
         Physics(), connection_threshold=layout.shortest, max_springs=2 if layout.body.kind == "line" else 8,
         bending_stiffness=1e-3 if "bending_stiffness" in names else 0.0,
     )  # fmt: skip
-    space = search_space(physics, names, config.effects, terms=config.terms)
+    space = search_space(physics, names, config.effects)
     knobs = []
     for knob in space.knobs:
         if knob.name == "connection_threshold":

@@ -108,13 +108,11 @@ class SearchSpace:
 
 
 def search_space(
-    physics: Physics, names: Sequence[str], effects: Sequence[str] = (), extensions: Sequence[Extension] = (),
-    terms: int = 4,
+    physics: Physics, names: Sequence[str], effects: Sequence[str] = (), extensions: Sequence[Extension] = ()
 ) -> SearchSpace:
     """Knobs for the named Physics fields and for every parameter of the named effects.
 
-    Effects not among `extensions` start at their null values. Of a vector parameter, the first `terms` components
-    are searched if it is a profile (more than 3), else all. Raises: ConfigError for an unknown name.
+    Effects not among `extensions` start at their null values. Raises: ConfigError for an unknown name.
     """
     fields = {f.name: f for f in dataclasses.fields(Physics)}
     knobs = []
@@ -127,7 +125,7 @@ def search_space(
         effect = find_effect(id)
         present.setdefault(id, effect.extension())
         for q in effect.parameters:
-            for k in range(min(terms, q.size) if q.size > WIDEST_VECTOR else q.size):
+            for k in range(q.size):
                 value = present[id].parameters[q.name][k]
                 start = max(value, q.low) if q.log else value
                 profile = q.size > WIDEST_VECTOR or bool(q.starts)

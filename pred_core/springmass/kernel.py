@@ -159,6 +159,7 @@ def _laws(effects: tuple[type[Effect], ...]) -> dict[str, str]:
         "spring": ("@SPRING@", _spring),
         "contact": ("@CONTACT@", _contact),
         "boundary": ("@BOUNDARY@", _boundary),
+        "bend_stiffness": ("@BEND_STIFFNESS@", _bend_stiffness),
     }
     parts: dict[str, list[str]] = {placeholder: [] for placeholder, _ in writers.values()}
     parts["@BEND@"] = []
@@ -216,6 +217,11 @@ def _force(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
     )
     f = effect.force(p, at)
     return [f"f{k} += {lane_text(v)};" for k, v in zip("xyz", (f.x, f.y, f.z), strict=True)]
+
+
+def _bend_stiffness(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
+    relative = effect.bend_stiffness(p, _value(code, "Lane(e[2])"))
+    return [f"weight += bending * e[0] * {relative.name};"]
 
 
 def _spring(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:

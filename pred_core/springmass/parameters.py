@@ -45,7 +45,7 @@ def bend_bounds(per_world: PerWorld, worlds: int) -> list[tuple[float, float]]:
     """Relative bending stiffness and bending damping time [s] that each world's effects add."""
     bounds = []
     for extensions in per_world:
-        pairs = [find_effect(e.id).bend_bound({k: v[0] for k, v in e.parameters.items()}) for e in extensions]
+        pairs = [find_effect(e.id).bend_bound(e.parameters) for e in extensions]
         bounds.append((sum(p[0] for p in pairs), sum(p[1] for p in pairs)))
     return [bounds[w % len(bounds)] for w in range(worlds)]
 

@@ -37,7 +37,7 @@ def bend_forces(sim: Reference, x: Tensor, held: Tensor, rotation: Tensor, h: fl
     length_a, length_b = a.norm(dim=-1, keepdim=True), b.norm(dim=-1, keepdim=True)
     a, b = a / length_a, b / length_b
     q = 1.0 / (1.0 + _dot(a, b)).clamp_min(FOLD)
-    weight = sim.bending * sim.bend_rows[:, 0]
+    weight = sim.bending * sim.bend_rows[:, 0] * (1.0 + _relative_stiffness(sim))
     alpha = -4.0 * weight[..., None] * q * q
     along_a, along_b = alpha * b, alpha * a
     if sim.hooks("bend"):
@@ -81,6 +81,14 @@ def _moments(
         m1, m2, memory.effects[number] = effect.bend(p, at)
         first, second = first + m1, second + m2
     return first, second, (d1, d2)
+
+
+def _relative_stiffness(sim: Reference) -> Tensor:
+    """(1, 1) or (W, B): relative bending stiffness that effects add."""
+    total = torch.zeros(1, 1, dtype=torch.float64)
+    for effect, p in sim.hooks("bend_stiffness"):
+        total = total + effect.bend_stiffness(p, sim.bend_rows[:, 2][None])
+    return total
 
 
 def _end_twist(sim: Reference) -> Tensor:

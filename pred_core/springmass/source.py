@@ -25,6 +25,14 @@ PRELUDE = r"""
   auto lane_min = [&](Lane a, Lane b) -> Lane { return lane_select(a < b, a, b); };
   auto lane_max = [&](Lane a, Lane b) -> Lane { return lane_select(a > b, a, b); };
   const Lane zero = Lane(0.0f), one = Lane(1.0f), tiny = Lane(1e-18f);
+  // Straight lines between `count` values at 0, 1/(count-1), ..., 1; the place is the same in all lanes.
+  auto lane_interpolate = [](const Lane* values, int count, float place) -> Lane {
+    const float inside = place < 0.0f ? 0.0f : place > 1.0f ? 1.0f : place;
+    const float scaled = inside * (count - 1);
+    const int below = scaled < count - 2 ? (int)scaled : count - 2;
+    const float rest = scaled - below;
+    return values[below] * (1.0f - rest) + values[below + 1] * rest;
+  };
   const int D = @STRIDE@;  // floats a particle takes per lane: x y z (and one unused)
 
   // Model: shared by all worlds.

@@ -16,7 +16,8 @@ BEND = r"""
     // A fold beyond 178 degrees has no finite curvature: the force is bounded there.
     const Lane q = one / lane_max(one + c, Lane(3e-4f));
     // dE/dt1 = alpha t2 , dE/dt2 = alpha t1; components along t1 (t2) do no work.
-    const Lane weight = bending * e[0];
+    Lane weight = bending * e[0];
+    @BEND_STIFFNESS@
     const Lane alpha = Lane(-4.0f) * weight * q * q;
     Lane gax = alpha * bx, gay = alpha * by, gaz = alpha * bz;
     Lane gbx = alpha * ax, gby = alpha * ay, gbz = alpha * az;
