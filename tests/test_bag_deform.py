@@ -54,6 +54,16 @@ def _quiet(done: int, total: int, name: str) -> None:
     pass
 
 
+def assert_clamps_turn_with_their_edges(position: np.ndarray, rotation: torch.Tensor) -> None:
+    """The rotation takes the vertical (down at the first end, up at the last) to the clamped edge, with no roll."""
+    for gripper, (a, b), up in ((0, (0, 1), -1.0), (1, (0, 1), -1.0), (2, (-2, -1), 1.0), (3, (-2, -1), 1.0)):
+        edge = torch.as_tensor(position[:, b] - position[:, a], dtype=torch.float32)
+        edge = edge / edge.norm(dim=-1, keepdim=True)
+        turned = quaternion_rotate(rotation[:, gripper], torch.tensor([0.0, 0.0, up]))
+        assert torch.allclose(turned, edge, atol=1e-6)
+        assert rotation[:, gripper, 3].abs().max() < 1e-6  # the axis is horizontal
+
+
 def test_the_data_set_contract(tmp_path: Path) -> None:
     source = read_deform(_npz(tmp_path / "deform_x.npz"))
     dataset = convert_deform(source, tmp_path / "out", _quiet)
@@ -65,7 +75,7 @@ def test_the_data_set_contract(tmp_path: Path) -> None:
     for i, episode in enumerate(dataset.episodes()):
         assert np.array_equal(episode.position, _positions()[i])
         assert np.array_equal(episode.grips.position.numpy(), _positions()[i][:, [0, 1, 5, 6]])
-        assert torch.equal(episode.grips.rotation, torch.tensor([1.0, 0, 0, 0]).expand(30, 4, 4))
+        assert_clamps_turn_with_their_edges(episode.position, episode.grips.rotation)
         assert bool(episode.grips.closed.all())
         assert episode.held.tolist() == [0, 1, -1, -1, -1, 2, 3]
 
