@@ -1,4 +1,5 @@
 # make run    the main job: measured cable -> ROS 2 topics -> prediction -> score and report
+#             (make run ARGS="--factor 2 --episodes 14"; ARGS=--help lists them)
 # make test   set-up, lint, tests            make bench  the benchmarks
 # make lint   ruff and mypy                  make clean  remove what was built (out/ and data/ stay)
 
@@ -22,7 +23,7 @@ $(STAMP): setup.py setup.cfg pyproject.toml constraints.txt
 	@touch $@
 
 run: $(STAMP)
-	$(BIN)/python -m pred_ros.replay
+	$(BIN)/python -m pred_ros.replay $(ARGS)
 
 test: lint
 	$(BIN)/python -m pytest -q

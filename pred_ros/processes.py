@@ -18,6 +18,8 @@ from types import TracebackType
 from pred_core.errors import ConfigError, nearest
 from pred_ros.resources import fastdds_profile
 
+# A node started with this variable ends when its parent is gone, however that ended.
+END_WITH_PARENT = "PRED_END_WITH_PARENT"
 NODES = ("player", "predictor", "evaluator")
 POLITE = 4.0  # [s] between SIGINT and SIGKILL
 
@@ -36,6 +38,7 @@ def node_environment(domain: int | None = None) -> dict[str, str]:
     environment.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
     environment.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(fastdds_profile()))
     environment["PYTHONUNBUFFERED"] = "1"
+    environment[END_WITH_PARENT] = "1"
     if domain is not None:
         environment["ROS_DOMAIN_ID"] = str(domain)
         environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"

@@ -7,11 +7,13 @@ what is missing, runs player, predictor and evaluator, then `pred evaluate` for 
 from __future__ import annotations
 
 import argparse
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 from pred_core.bag.dataset import FILE, load_dataset
 from pred_core.bag.measured import find_measured
@@ -36,6 +38,7 @@ class Source:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point. Returns 0 done, 2 bad input, 130 interrupted."""
     args = _parser().parse_args(argv)
+    before = signal.signal(signal.SIGTERM, _interrupt)
     try:
         run(args)
     except PredError as error:
@@ -44,7 +47,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("pred_replay: interrupted; nothing is left running", file=sys.stderr)
         return INTERRUPTED
+    finally:
+        signal.signal(signal.SIGTERM, before)
     return 0
+
+
+def _interrupt(number: int, frame: object) -> NoReturn:
+    """SIGTERM ends the nodes as Ctrl-C does."""
+    raise KeyboardInterrupt
 
 
 def run(args: argparse.Namespace) -> None:

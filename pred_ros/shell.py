@@ -21,6 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 from pred_core.errors import PredError
 from pred_ros import parameters
 from pred_ros.diagnostics import ERROR, OK, WARN, Diagnostics
+from pred_ros.processes import END_WITH_PARENT
 
 BAD_INPUT = 2
 POLL = 0.05  # [s] how soon a signal or the end of the work is noticed
@@ -178,7 +179,8 @@ def _spin(node: Shell, asked: list[int]) -> int:
                     transition()
                 if node.bug is not None:
                     raise node.bug
-        while node.exit_code is None and not asked:
+        parent = os.getppid() if END_WITH_PARENT in os.environ else None
+        while node.exit_code is None and not asked and parent in (None, os.getppid()):
             executor.spin_once(timeout_sec=POLL)
         return node.exit_code or 0
     finally:

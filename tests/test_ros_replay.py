@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -137,6 +138,23 @@ def test_children_that_ignore_signals_are_killed_with_their_children(tmp_path: P
         wait_for(lambda: "up" in children.log("stubborn"), 20.0, "the child is up")
         children.polite = 0.2
     wait_for(lambda: is_gone(process.pid), 2.0, "the whole group is gone")
+
+
+def test_a_node_does_not_outlive_a_parent_that_was_killed(tmp_path: Path) -> None:
+    parent = (
+        "import sys, time; from pathlib import Path; from pred_ros.processes import *\n"
+        "with Children(node_environment(free_domain()), Path(sys.argv[1])) as children:\n"
+        "    node = children.start('evaluator', node_command('evaluator', {'out': sys.argv[1]}))\n"
+        "    print(node.pid, flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    command = [sys.executable, "-c", parent, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT, env=node_environment()) as process:
+        assert process.stdout is not None
+        node = int(process.stdout.readline())
+        wait_for(lambda: "no pairs yet" in (tmp_path / "evaluator.log").read_text(), 30.0, "the node is up")
+        process.kill()
+    wait_for(lambda: is_gone(node), 2.0, "the node ends by itself")
 
 
 def test_a_child_starts_the_ros_bootstrap_anew(monkeypatch: pytest.MonkeyPatch) -> None:
