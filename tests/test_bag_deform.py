@@ -14,6 +14,7 @@ from pred_core.bag.deform import convert_deform, group_recordings, read_deform
 from pred_core.bag.measured import find_measured
 from pred_core.bag.pickles import read_pickled_numbers
 from pred_core.errors import DatasetError
+from pred_core.frames import quaternion_rotate
 
 VERTICES = 7
 
