@@ -21,7 +21,7 @@ from pred_core.twin import Twin, TwinMeta
 from pred_core.types import ObjectInfo, Physics, Scene
 
 FLAGS = [
-    "--steps", "40", "--rollout", "3", "--batch", "4", "--evaluate-every", "15", "--feature", "16", "--hidden", "16",
+    "--steps", "100", "--rollout", "2", "--batch", "4", "--evaluate-every", "40", "--feature", "16", "--hidden", "16",
     "--embedding", "16", "--encoder-layers", "1", "--holdout", "0.3", "--seed", "3", "--cap", "0.2",
 ]  # fmt: skip
 
@@ -55,13 +55,14 @@ def start(arguments: list[str]) -> subprocess.Popen[str]:
     )
 
 
+# 100 steps take seconds, so that the signal comes long before the last even where this process gets little time.
 def signal_after_first_step(process: subprocess.Popen[str], number: signal.Signals) -> str:
     """Wait for the first step, send the signal, wait for the end; what it printed."""
     assert process.stderr is not None
     printed = ""
     for line in process.stderr:
         printed += line
-        if "step 1/40" in line:
+        if "step 1/100" in line:
             process.send_signal(number)
             break
     printed += process.stderr.read()
@@ -83,8 +84,8 @@ def test_writes_a_twin_that_predicts_and_a_report(case: Path, whole: bytes) -> N
     assert isinstance(load_dynamics(twin), PReD)
     assert twin.meta.parent == Twin.load(case / "twin").digest() and len(twin.meta.data) == 4
     report = json.loads((case / "whole" / "train.json").read_text())
-    assert len(report["curves"]["loss"]) == 40 and report["network"]["cap"] == 0.2
-    assert "--steps 40" in report["command"]
+    assert len(report["curves"]["loss"]) == 100 and report["network"]["cap"] == 0.2
+    assert "--steps 100" in report["command"]
     assert "share of components at the cap" in (case / "whole" / "train.html").read_text()
     assert not (case / "whole" / CHECKPOINT).exists()
 
