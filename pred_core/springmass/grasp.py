@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -38,11 +40,12 @@ def check_poses(grip: Grip) -> None:
     """Raise InputError unless every pose is finite and every rotation a unit quaternion."""
     if not grip.rotation.numel():
         return
-    error = (grip.rotation.square().sum(-1) - 1.0).abs().max()
-    if not bool((error <= 2e-2) & grip.position.sum().isfinite()):
-        if not bool(torch.isfinite(error + grip.position.sum())):
+    error = float((grip.rotation.square().sum(-1) - 1.0).abs().max())
+    total = error + float(grip.position.sum())
+    if not (error <= 2e-2 and math.isfinite(total)):
+        if not math.isfinite(total):
             raise InputError("gripper pose is not finite", next_step="Stop the arm; check the source of gripper/pose")
-        off = f"norm off by {0.5 * float(error):.3g}"
+        off = f"norm off by {0.5 * error:.3g}"
         raise InputError("gripper rotation is not a unit quaternion (wxyz)", got=off)
 
 
@@ -58,6 +61,9 @@ def flatten_grip(grip: Grip, lead: torch.Size, device: str) -> Grip:
     if not (fits and grip.position.is_floating_point() and grip.rotation.is_floating_point()):
         raise InputError("gripper poses", got=f"position, rotation, closed of shapes {shapes}",
                          allowed=f"{axes} + (G, 3), (G, 4) floats and (G,)")  # fmt: skip
+    usual = grip.position.dtype == grip.rotation.dtype == torch.float32 and grip.closed.dtype == torch.bool
+    if usual and grip.position.shape[:-2] == lead == grip.closed.shape[:-1] and len(lead) == 1:
+        return Grip(grip.position.to(device), grip.rotation.to(device), grip.closed.to(device))
     try:
         return Grip(
             grip.position.expand(*lead, g, 3).reshape(count, g, 3).to(device, torch.float32),

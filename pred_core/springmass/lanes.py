@@ -23,11 +23,12 @@ def pack_into(packed: Tensor, values: Tensor) -> None:
     missing = blocks * lanes - values.shape[0]
     if missing:
         values = torch.cat((values, values[-1:].expand(missing, *values.shape[1:])))
-    packed.movedim(-1, 1).copy_(values.unflatten(0, (blocks, lanes)))
+    packed.movedim(-1, 1).copy_(values.reshape(blocks, lanes, *values.shape[1:]))
 
 
 def unpack(packed: Tensor, worlds: int) -> Tensor:
     """A copy (W, ...) of packed (blocks, ..., lanes)."""
     if packed.shape[-1] == 1:
         return packed.squeeze(-1).clone()
-    return packed.movedim(-1, 1).flatten(0, 1)[:worlds].clone(memory_format=torch.contiguous_format)
+    moved = packed.movedim(-1, 1).clone(memory_format=torch.contiguous_format)
+    return moved.view(-1, *moved.shape[2:])[:worlds]

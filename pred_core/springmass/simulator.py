@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -98,7 +99,7 @@ class SpringMass:
         flat, lead = self._flatten(state)
         poses = grasp.flatten_grip(grip, lead, self.device)
         after, _ = self._advance(flat, Grip(poses.position[None], poses.rotation[None], poses.closed[None]), False)
-        self._check(after.position[None])
+        self._check(after.position)
         return _unflatten(after, lead)
 
     def rollout(self, state: State, grips: Grip) -> Tensor:
@@ -143,7 +144,7 @@ class SpringMass:
         pack_into(work.velocity, state.velocity)
         tensors["force"].zero_()  # a diverged world leaves its forces behind
         if len(held_particles):
-            pack_into(tensors["held_offset"], memory["grip_offset"][:, held_particles])
+            pack_into(tensors["held_offset"], memory["grip_offset"].index_select(1, held_particles))
         if grips.position.shape[2]:
             pack_into(tensors["grips"], _poses(before, grips))
         if self.effects:
@@ -223,14 +224,17 @@ class SpringMass:
             raise InputError("state", got=got, allowed=f"(..., {n}, 3), the same, (..., {n})")
         if not p.is_floating_point() or not v.is_floating_point() or h.is_floating_point() or h.dtype == torch.bool:
             raise InputError("state", got=f"{p.dtype}, {v.dtype}, {h.dtype}", allowed="floats, floats, integer indices")
-        count = lead.numel()
-        flat = State(
-            p.reshape(count, n, 3).to(self.device, torch.float32),
-            v.reshape(count, n, 3).to(self.device, torch.float32),
-            h.reshape(count, n).to(self.device),
-            {k: m.reshape(count, *m.shape[len(lead) :]) for k, m in state.memory.items()},
-        )
-        if not self.diverged_as_nan and not bool((flat.position.sum() + flat.velocity.sum()).isfinite()):
+        if len(lead) == 1 and p.dtype == v.dtype == torch.float32 and self.device == "cpu" == p.device.type:
+            flat = state  # nothing to do: calls are short, every operation counts
+        else:
+            count = lead.numel()
+            flat = State(
+                p.reshape(count, n, 3).to(self.device, torch.float32),
+                v.reshape(count, n, 3).to(self.device, torch.float32),
+                h.reshape(count, n).to(self.device),
+                {k: m.reshape(count, *m.shape[len(lead) :]) for k, m in state.memory.items()},
+            )
+        if not self.diverged_as_nan and not math.isfinite(float(flat.position.sum()) + float(flat.velocity.sum())):
             bad = ~torch.isfinite(flat.position + flat.velocity).all(-1)
             if bool(bad.any()):
                 world, particle = torch.nonzero(bad)[0].tolist()
@@ -239,10 +243,10 @@ class SpringMass:
         return flat, lead
 
     def _check(self, positions: Tensor) -> None:
-        """(T, W, N, 3): raise DivergenceError at the first period that is not finite."""
-        if self.diverged_as_nan or bool(positions.sum().isfinite()):
+        """(T, W, N, 3) or (W, N, 3): raise DivergenceError at the first period that is not finite."""
+        if self.diverged_as_nan or math.isfinite(float(positions.sum())):
             return
-        bad = ~torch.isfinite(positions).flatten(2).all(-1)
+        bad = ~torch.isfinite(positions.reshape(-1, *positions.shape[-3:])).flatten(2).all(-1)
         if not bool(bad.any()):
             return
         period, world = torch.nonzero(bad)[0].tolist()
@@ -258,7 +262,7 @@ def _poses(before: Grip, grips: Grip) -> Tensor:
     rotation = torch.cat((before.rotation[None], grips.rotation))
     closed = torch.cat((grips.closed[:1], grips.closed)).to(position.dtype)[..., None]
     dot = (rotation[1:] * rotation[:-1]).sum(-1, keepdim=True)
-    if bool((dot < 0).any()):
+    if float(dot.min()) < 0.0:
         sign = torch.where(dot < 0, -1.0, 1.0)
         rotation = torch.cat((rotation[:1], rotation[1:] * sign.cumprod(0)))
     return torch.cat((position, rotation, closed), dim=-1).movedim(1, 0)
