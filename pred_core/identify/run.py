@@ -44,6 +44,19 @@ class Identified:
     left_out: tuple[str, ...]
     noise_mm: float
     seconds: float
+    seed: int
+
+    def summary(self) -> dict[str, object]:
+        """What `identify.json` holds: all but the twin."""
+        return {
+            "parameters": self.values,
+            "restarts": self.restarts,
+            "error_mm": {"fitted": self.fitted_mm, "held_out": self.held_out_mm, "episodes": self.windows},
+            "left_out": list(self.left_out),
+            "track_noise_mm": self.noise_mm,
+            "seconds": self.seconds,
+            "seed": self.seed,
+        }
 
 
 def identify(
@@ -98,6 +111,7 @@ def identify(
         left_out=refined.left_out if refined is not None else (),
         noise_mm=1e3 * noise,
         seconds=time.monotonic() - begin,
+        seed=config.seed,
     )
 
 

@@ -1,0 +1,130 @@
+"""`pred identify`: fit a twin's physics to the train split of a data set."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import shlex
+import sys
+import time
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from pred_core.bag.dataset import load_dataset
+from pred_core.config import from_mapping
+from pred_core.identify.config import PAPER, IdentifyConfig
+from pred_core.identify.report import write_report
+from pred_core.identify.run import identify, train_episodes
+
+NAME = "identify"
+HELP = "fit a twin's physics to the train episodes of a data set (paper III-A)"
+JOURNAL = "identify.journal.jsonl"
+QUIET_SECONDS = 2.0  # between progress lines where stderr is no terminal
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Flags: the files, and one flag for every field of the configuration."""
+    parser.add_argument("dataset", type=Path, help="data set folder; its train split is used")
+    parser.add_argument("--out", type=Path, required=True, metavar="TWIN", help="twin to write")
+    parser.add_argument("--paper", action="store_true", help="search the paper's five parameters alone")
+    hints = get_type_hints(IdentifyConfig)
+    for field in dataclasses.fields(IdentifyConfig):
+        flag = "--" + field.name.replace("_", "-")
+        text = f"{field.metadata['doc']} (default: {_shown(field.default)}{' ' + field.metadata['unit'] if field.metadata['unit'] else ''})"
+        if hints[field.name] is bool:
+            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=None, help=text)
+        else:
+            parser.add_argument(flag, default=None, metavar="VALUE", help=text.replace("%", "%%"))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Identify, write the twin, `identify.json` and `identify.html`. Interrupted and run again, it goes on."""
+    config = _config(args)
+    dataset = load_dataset(args.dataset)
+    show = _Progress()
+    journal = args.out / JOURNAL
+    resumed = journal.is_file()
+    if resumed:
+        show(f"going on with the search in {journal}")
+    command = shlex.join(["pred", "identify", str(args.dataset), "--out", str(args.out), *_given(args)])
+    result = identify(dataset, train_episodes(dataset), config, journal, show, command)
+    show.end()
+    result.twin.save(args.out)
+    journal.unlink()
+    summary = result.summary()
+    (args.out / "identify.json").write_text(json.dumps(summary, indent=1), encoding="utf-8")
+    write_report(args.out / "identify.html", result, command)
+    for name, entry in result.values.items():
+        bound = "  AT BOUND" if entry["at_bound"] else ""
+        print(f"{name:32} {entry['value']:.5g} {entry['unit']}{bound}")
+    check = "" if result.held_out_mm is None else f"; {result.held_out_mm:.2f} mm on recordings held out"
+    print(f"mean error per coordinate of free particles: {result.fitted_mm:.2f} mm on the best 90 % of episodes{check}")
+    print(f"wrote {args.out} and {args.out / 'identify.html'} in {result.seconds:.0f} s")
+    return 0
+
+
+class _Progress:
+    """One line on stderr: rewritten on a terminal, else printed every two seconds."""
+
+    def __init__(self) -> None:
+        self.terminal = sys.stderr.isatty()
+        self.last = 0.0
+
+    def __call__(self, line: str) -> None:
+        now = time.monotonic()
+        if self.terminal:
+            print(f"\r{line:<100}", end="", file=sys.stderr, flush=True)
+        elif now - self.last > QUIET_SECONDS:
+            self.last = now
+            print(line, file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        """Leave the line."""
+        if self.terminal:
+            print(file=sys.stderr)
+
+
+def _config(args: argparse.Namespace) -> IdentifyConfig:
+    """The configuration the flags describe. Raises: ConfigError naming the flag."""
+    hints = get_type_hints(IdentifyConfig)
+    values: dict[str, Any] = {"parameters": PAPER} if args.paper else {}
+    for field in dataclasses.fields(IdentifyConfig):
+        given = getattr(args, field.name)
+        if given is not None:
+            values[field.name] = given if isinstance(given, bool) else _parsed(given, hints[field.name])
+    return from_mapping(IdentifyConfig, values, "pred identify")
+
+
+def _parsed(text: str, hint: Any) -> Any:
+    """A flag's text as the number or list it stands for; what does not parse is left for the strict check."""
+    if hint == tuple[str, ...]:
+        return tuple(part for part in text.split(",") if part)
+    if hint == tuple[float, ...]:
+        return tuple(_number(part) for part in text.split(",") if part)
+    return _number(text)
+
+
+def _number(text: str) -> Any:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _shown(value: Any) -> str:
+    return ",".join(str(v) for v in value) if isinstance(value, tuple) else str(value)
+
+
+def _given(args: argparse.Namespace) -> list[str]:
+    flags = ["--paper"] if args.paper else []
+    for field in dataclasses.fields(IdentifyConfig):
+        given = getattr(args, field.name)
+        flag = "--" + field.name.replace("_", "-")
+        if isinstance(given, bool):
+            flags.append(flag if given else flag.replace("--", "--no-", 1))
+        elif given is not None:
+            flags += [flag, str(given)]
+    return flags
