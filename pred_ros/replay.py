@@ -23,6 +23,7 @@ from pred_ros.live import Replay, replay
 from pred_ros.resources import config_folder, sample_dataset
 
 MEASURED = ("deform_dlo2", "deform_dlo1")  # in this order
+SAMPLE = "bundled and synthetic; no measured data found (set PRED_DATA to their folder)"
 TWIN_FILE = "twin.yaml"
 
 
@@ -32,7 +33,7 @@ class Source:
 
     name: str
     path: Path  # an .npz to convert, or a data set
-    measured: bool
+    origin: str  # said to the user
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -61,8 +62,7 @@ def run(args: argparse.Namespace) -> None:
     """Choose, prepare, replay, evaluate, and say where everything is. Raises: PredError."""
     source = choose_source(args.dataset)
     out = args.out / source.name
-    kind = "measured data" if source.measured else "the bundled synthetic sample (no measured data found)"
-    print(f"1. data: {source.name}, {kind}: {source.path}", flush=True)
+    print(f"1. data: {source.name}, {source.origin}: {source.path}", flush=True)
     dataset = prepare_dataset(source, args.out / "datasets" / source.name)
     twin = args.twin or prepare_twin(source, dataset, args.out / "twins" / source.name)
     print(f"2. twin: {twin}", flush=True)
@@ -87,12 +87,12 @@ def run(args: argparse.Namespace) -> None:
 def choose_source(dataset: Path | None) -> Source:
     """The data set given, else measured data, else the bundled sample. Raises: PredError."""
     if dataset is not None:
-        return Source(load_dataset(dataset).object.name, dataset, True)
+        return Source(load_dataset(dataset).object.name, dataset, "the data set given")
     for name in MEASURED:
         found = find_measured(name)
         if found is not None:
-            return Source(name, found, True)
-    return Source("sample_cable", sample_dataset(), False)
+            return Source(name, found, "measured data")
+    return Source("sample_cable", sample_dataset(), SAMPLE)
 
 
 def prepare_dataset(source: Source, folder: Path) -> Path:

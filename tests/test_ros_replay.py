@@ -168,12 +168,13 @@ def test_a_child_starts_the_ros_bootstrap_anew(monkeypatch: pytest.MonkeyPatch) 
 def test_measured_data_come_first_and_the_sample_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = {"deform_dlo1": tmp_path / "deform_dlo1.npz", "deform_dlo2": tmp_path / "deform_dlo2.npz"}
     monkeypatch.setattr(main_job, "find_measured", found.get)
-    assert main_job.choose_source(None).name == "deform_dlo2" and main_job.choose_source(None).measured
+    chosen = main_job.choose_source(None)
+    assert (chosen.name, chosen.origin) == ("deform_dlo2", "measured data")
     del found["deform_dlo2"]
     assert main_job.choose_source(None).name == "deform_dlo1"
     found.clear()
     sample = main_job.choose_source(None)
-    assert sample.path == SAMPLE and not sample.measured
+    assert sample.path == SAMPLE and "synthetic" in sample.origin
     assert main_job.prepare_dataset(sample, tmp_path / "unused") == SAMPLE
     assert main_job.episode_names(SAMPLE, "test", 1) == ("ep004",)
 
