@@ -241,7 +241,8 @@ class PredictorNode(Shell):
         self._stopping = False
         while not self._stopping and (action := self._inbox.get()) is not None:
             try:
-                action()
+                with torch.no_grad():
+                    action()
             except TwinError:
                 raise
             except DivergenceError as error:
