@@ -1,6 +1,6 @@
 """The simulator's speed on one CPU thread: paired ratios against two other solvers, and growth with N and worlds.
 
-    python benchmarks/simulator.py [--quick] [--rounds 9] [--out out]
+    python benchmarks/simulator.py [--quick] [--rounds 25] [--out out]
 
 Against (a) a plain Warp loop, one launch for springs and one for particles a substep, and (b) Newton's
 semi-implicit solver (`pip install newton`; left out if it is not there). Rounds alternate the
@@ -90,8 +90,8 @@ def plain_particles(
     force_out[i] = wp.vec3(0.0, 0.0, 0.0)
 
 
-def plain_warp(body: Body, substeps: int) -> Callable[[], Tensor3]:
-    """Two recorded launches a substep."""
+def plain_warp(body: Body, substeps: int, recorded: bool) -> Callable[[], Tensor3]:
+    """Two launches a substep, by `wp.launch` or recorded once and replayed."""
     start = state_of(body, 1)
     x0 = wp.array(start.position[0].numpy(), dtype=wp.vec3, device="cpu")
     v0 = wp.array(start.velocity[0].numpy(), dtype=wp.vec3, device="cpu")
@@ -99,17 +99,21 @@ def plain_warp(body: Body, substeps: int) -> Callable[[], Tensor3]:
     ends = wp.array(body.springs, dtype=wp.vec2i, device="cpu")
     rest = wp.array(body.rest_length.astype(np.float32), dtype=wp.float32, device="cpu")
     mass = wp.array(body.mass.astype(np.float32), dtype=wp.float32, device="cpu")
-    springs = wp.launch(plain_springs, dim=len(body.springs), device="cpu", record_cmd=True,
-                        inputs=[x, v, ends, rest, PHYSICS.stiffness, PHYSICS.damping], outputs=[f])  # fmt: skip
-    particles = wp.launch(plain_particles, dim=body.count, device="cpu", record_cmd=True,
-                          inputs=[mass, wp.vec3(*Scene().gravity), SUBSTEP], outputs=[x, v, f])  # fmt: skip
+    forces = {"inputs": [x, v, ends, rest, PHYSICS.stiffness, PHYSICS.damping], "outputs": [f], "device": "cpu"}
+    motion = {"inputs": [mass, wp.vec3(*Scene().gravity), SUBSTEP], "outputs": [x, v, f], "device": "cpu"}
+    springs = wp.launch(plain_springs, dim=len(body.springs), record_cmd=True, **forces)
+    particles = wp.launch(plain_particles, dim=body.count, record_cmd=True, **motion)
 
     def run() -> Tensor3:
         wp.copy(x, x0)
         wp.copy(v, v0)
         for _ in range(substeps):
-            springs.launch()
-            particles.launch()
+            if recorded:
+                springs.launch()
+                particles.launch()
+            else:
+                wp.launch(plain_springs, dim=len(body.springs), **forces)
+                wp.launch(plain_particles, dim=body.count, **motion)
         return x.numpy().copy()
 
     return run
@@ -170,7 +174,7 @@ def against_others(rounds: int, substeps: int) -> None:
     """Equal trajectories, then ratios at N = 1000."""
     body = cube(1000)
     runs: dict[str, Callable[[], Any]] = {"one": ours(body, 1, substeps), "many": ours(body, 32, substeps)}
-    runs["plain"] = plain_warp(body, substeps)
+    runs["plain"], runs["replayed"] = plain_warp(body, substeps, False), plain_warp(body, substeps, True)
     solver = newton(body, substeps)
     if solver is not None:
         runs["newton"] = solver
@@ -185,12 +189,14 @@ def against_others(rounds: int, substeps: int) -> None:
     times = paired(runs, rounds)
     print(f"{'':34}{'ns a spring and world':>22}")
     for name, label, worlds in (("one", "ours, 1 world", 1), ("many", "ours, 32 worlds", 32),
-                                ("plain", "plain Warp, 2 launches a substep", 1), ("newton", "Newton", 1)):  # fmt: skip
+                                ("plain", "plain Warp, 2 launches a substep", 1),
+                                ("replayed", "the same, replayed", 1), ("newton", "Newton", 1)):  # fmt: skip
         if name in times:
             print(f"{label:34}{min(times[name]) / substeps / springs / worlds * 1e9:22.2f}")
     print(f"{'ratio':34}{'min/min':>6} {'median':>8}")
     print(f"{'plain / ours, 1 world':34}{ratio(times['plain'], times['one'])}    goal 2")
     print(f"{'plain / ours, a world of 32':34}{ratio(times['plain'], times['many'], 32)}    goal 10")
+    print(f"{'replayed / ours, 1 world':34}{ratio(times['replayed'], times['one'])}")
     if "newton" in times:
         print(f"{'Newton / ours, 1 world':34}{ratio(times['newton'], times['one'])}    goal 2")
     else:
@@ -260,14 +266,14 @@ def calls(rounds: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="few substeps and sizes")
-    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--rounds", type=int, default=25, help="at least 9")
     parser.add_argument("--out", type=Path, default=Path("out"))
     args = parser.parse_args()
     torch.set_num_threads(1)
-    substeps = 60 if args.quick else 200
+    substeps = 50  # short calls, many rounds: on a shared machine some of them run undisturbed
     against_others(args.rounds, substeps)
     counts = [1000, 2000, 5000] if args.quick else [250, 500, 1000, 2000, 3000, 4000, 5000]
-    growth(args.rounds, substeps // 2, counts, [1, 4, 16, 32] if args.quick else [1, 2, 4, 8, 16, 32, 64], args.out)
+    growth(args.rounds, substeps, counts, [1, 4, 16, 32] if args.quick else [1, 2, 4, 8, 16, 32, 64], args.out)
     real_time(3)
     calls(args.rounds)
 

@@ -88,22 +88,25 @@ def compare(sim: SpringMass, twin: Reference, state: Any, first: Grip, grips: Gr
     return float((positions[-1] - state.position).abs().max())
 
 
-@pytest.mark.parametrize("staged", [False, True])
-def test_random_objects_with_every_feature_equal_the_reference(staged: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("worlds", "staged"), [(3, False), (5, False), (3, True)])
+def test_random_objects_with_every_feature_equal_the_reference(
+    worlds: int, staged: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(LIBRARY, Everything.id, Everything)
     rng = np.random.default_rng(7)
     body = blob(rng)
     assert len(body.bends) > 3
-    worlds, periods = 3, 4
+    periods = 4
     physics = [Physics(stiffness=k, damping=d, ground_friction=f, bending_stiffness=e)
-               for k, d, f, e in ((60.0, 0.2, 0.3, 2e-4), (100.0, 0.05, 0.9, 0.0), (80.0, 0.5, 0.0, 1e-4))]  # fmt: skip
+               for k, d, f, e in ((60.0, 0.2, 0.3, 2e-4), (100.0, 0.05, 0.9, 0.0), (80.0, 0.5, 0.0, 1e-4),
+                                  (70.0, 0.1, 0.5, 1e-4), (90.0, 0.3, 0.2, 0.0))][:worlds]  # fmt: skip
     tilted = (0.96, 0.28, 0.0, 0.0)
     scene = Scene(
         gravity=(1.0, -0.5, -9.0), ground=-0.075, pusher_radius=0.03, grasp_radius=0.03,
         fixtures=(Sphere((0.1, 0.0, -0.1), 0.05), Capsule((-0.1, -0.1, -0.1), (-0.1, 0.1, -0.05), 0.03),
                   Box((0.0, 0.1, 0.0), (0.2, 0.02, 0.05), tilted)),
     )  # fmt: skip
-    extension = [(Everything.extension(a=a, b=(0.5 * a, -a)),) for a in (0.2, 0.6, 1.0)]
+    extension = [(Everything.extension(a=a, b=(0.5 * a, -a)),) for a in (0.2, 0.6, 1.0, 0.4, 0.8)[:worlds]]
     mask = torch.tensor(rng.integers(0, 4, (worlds, len(body.springs))) > 0, dtype=torch.float32)
     options: dict[str, Any] = dict(extensions=extension, spring_mask=mask, self_collision=True, substeps=20)
     start = np.broadcast_to(body.rest_position, (worlds, body.count, 3)) + rng.normal(size=(worlds, 40, 3)) * 0.004

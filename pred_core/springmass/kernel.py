@@ -20,6 +20,7 @@ from pred_core.effects.effect import (
 from pred_core.springmass import source, source_bending, source_contact
 
 SIMD_LANES = 16  # worlds side by side on CPU
+FEW_WORLDS = 4  # fewer run one after the other, eight springs side by side: quicker than sixteen lanes
 wp.config.log_level = 30
 BASE_PARAMETERS = 4  # stiffness, damping, friction, bending_stiffness
 

@@ -195,7 +195,7 @@ class SpringMass:
     def _new_workspace(self, size: Size) -> Workspace:
         if self.worlds not in (1, size.worlds):
             raise InputError("worlds in the state", got=size.worlds, allowed=f"{self.worlds}, one for each Physics")
-        lanes = 1 if size.worlds == 1 or self.staged else kernel.SIMD_LANES
+        lanes = 1 if size.worlds < kernel.FEW_WORLDS or self.staged else kernel.SIMD_LANES
         constants = self._world_constants(size.worlds, lanes)
         model = self._arrays.model()
         model.bend_count, model.parameter_count = self._bends, self._rows.shape[1]
