@@ -5,6 +5,7 @@
     extensions.yaml         effects that the diagnosis or a user added, by id, with parameters and evidence
     residual.safetensors    network weights, if trained; configuration in its metadata
     twin.yaml               versions, period, scene, hashes of data and parents
+    base/                   optional: the plainer twin this one extends, identified by itself, to compare with
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,6 +76,7 @@ class Twin:
     extensions: tuple[Extension, ...] = ()
     residual: ResidualWeights | None = None
     physics_report: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # per parameter: spread, ...
+    base: Twin | None = None  # the plainer twin this one extends
 
     def replace(self, **changes: Any) -> Twin:
         """A copy with some fields changed."""
@@ -109,6 +112,10 @@ class Twin:
         meta = to_mapping(self.meta)
         meta["scene"] = _scene_to_mapping(self.scene)
         _write_yaml(path / "twin.yaml", meta)
+        if self.base is not None:
+            self.base.replace(base=None).save(path / "base")
+        elif (path / "base").is_dir():
+            shutil.rmtree(path / "base")
         weights = path / "residual.safetensors"
         if self.residual is None:
             weights.unlink(missing_ok=True)
@@ -148,6 +155,7 @@ class Twin:
             extensions=_load_extensions(path / "extensions.yaml"),
             residual=_load_residual(path / "residual.safetensors"),
             physics_report=report,
+            base=cls.load(path / "base") if (path / "base").is_dir() else None,
         )
 
     def digest(self) -> str:

@@ -16,6 +16,7 @@ from pred_core.config import from_mapping
 from pred_core.identify.config import PAPER, IdentifyConfig
 from pred_core.identify.report import write_report
 from pred_core.identify.run import identify, train_episodes
+from pred_core.twin import Twin
 
 NAME = "identify"
 HELP = "fit a twin's physics to the train episodes of a data set (paper III-A)"
@@ -27,6 +28,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Flags: the files, and one flag for every field of the configuration."""
     parser.add_argument("dataset", type=Path, help="data set folder; its train split is used")
     parser.add_argument("--out", type=Path, required=True, metavar="TWIN", help="twin to write")
+    text = "twin identified with fewer effects, kept inside as the spring-mass to compare with"
+    parser.add_argument("--base", type=Path, metavar="TWIN", help=text)
     parser.add_argument("--paper", action="store_true", help="search the paper's five parameters alone")
     hints = get_type_hints(IdentifyConfig)
     for field in dataclasses.fields(IdentifyConfig):
@@ -42,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
     """Identify, write the twin, `identify.json` and `identify.html`. Interrupted and run again, it goes on."""
     config = _config(args)
     dataset = load_dataset(args.dataset)
+    base = None if args.base is None else Twin.load(args.base)
     show = _Progress()
     journal = args.out / JOURNAL
     resumed = journal.is_file()
@@ -50,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     command = shlex.join(["pred", "identify", str(args.dataset), "--out", str(args.out), *_given(args)])
     result = identify(dataset, train_episodes(dataset), config, journal, show, command)
     show.end()
-    result.twin.save(args.out)
+    result.twin.replace(base=base).save(args.out)
     journal.unlink()
     summary = result.summary()
     (args.out / "identify.json").write_text(json.dumps(summary, indent=1), encoding="utf-8")
@@ -120,6 +124,7 @@ def _shown(value: Any) -> str:
 
 def _given(args: argparse.Namespace) -> list[str]:
     flags = ["--paper"] if args.paper else []
+    flags += ["--base", str(args.base)] if args.base is not None else []
     for field in dataclasses.fields(IdentifyConfig):
         given = getattr(args, field.name)
         flag = "--" + field.name.replace("_", "-")

@@ -44,12 +44,18 @@ class NamedTwin:
 def twin_models(named: NamedTwin) -> list[Model]:
     """The stages of a twin: spring-mass alone, with extensions, with the learned residual.
 
-    An unnamed twin gives one model a stage it has; a named one gives itself in full.
+    An unnamed twin gives one model a stage it has; a named one gives itself in full. The spring-mass stage of a twin
+    that carries its base is that base, which was identified by itself; parameters refitted together with
+    extensions would make a straw man of it.
     """
     twin = named.twin
     if named.name:
         return [_twin_model(named.name, named, extensions=True, residual=True)]
-    models = [_twin_model("spring-mass", named, extensions=False, residual=False)]
+    if twin.base is not None:
+        bases = tuple(t.base for t in named.folds if t.base is not None)
+        models = [_twin_model("spring-mass", NamedTwin("", twin.base, bases), extensions=True, residual=False)]
+    else:
+        models = [_twin_model("spring-mass", named, extensions=False, residual=False)]
     if twin.extensions:
         models.append(_twin_model("extended", named, extensions=True, residual=False))
     if twin.residual is not None:
