@@ -1,0 +1,111 @@
+"""Every number of the measured cables: convert, identify, train, evaluate; the twins that ship are its output.
+
+    python benchmarks/measured_cables.py dlo2 --out out/cables            # twins and the published split
+    python benchmarks/measured_cables.py dlo2 --out out/cables --folds 5  # and grouped by recording
+
+Each step is a `pred` command, printed as it runs, and is skipped when its result is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+from pred_core.bag.dataset import Dataset, load_dataset, write_dataset
+from pred_core.bag.measured import measured_or_explain
+
+EFFECTS = "bending_damping,bending_hysteresis,rest_curvature,bending_profile"
+CONTINUOUS = "stiffness,damping,bending_stiffness"  # first neighbours alone: skip springs would bend a second time
+IDENTIFY = {
+    "paper": ["--paper"],
+    "drag": ["--effects", "drag_linear"],
+    "chain": ["--effects", "bending_damping", "--parameters", CONTINUOUS],
+    "extended": ["--effects", EFFECTS, "--parameters", CONTINUOUS, "--stages", "1.0,1e9", "--restarts", "2"],
+}
+TRAIN = shlex.split(
+    "--gradient detached --carry 124 --rollout 4 --loss smooth --beta 0.3 --cap 0.02 --penalty 0.3 "
+    "--learning-rate 1e-3 --average 0.995 --arc-frequencies 3 --encoder-layers 2 --feature 32 --embedding 32 --feedforward 64 "
+    "--encoder-feedforward 64 --outlier 2"
+)
+SEEDS = (0, 1, 2)
+
+
+def main() -> int:
+    """Run the steps for one cable."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cable", choices=("dlo1", "dlo2"))
+    parser.add_argument("--out", type=Path, default=Path("out/cables"))
+    parser.add_argument("--folds", type=int, default=0, help="also identify for every fold of a grouped split")
+    parser.add_argument("--seeds", type=int, default=1, help="seeds of the residual network to train")
+    parser.add_argument("--steps", type=int, default=2500, help="training steps of the residual network")
+    args = parser.parse_args()
+    root = args.out / args.cable
+    data = root / "data"
+    if not (data / "dataset.yaml").exists():
+        pred("convert", "deform", str(measured_or_explain(f"deform_{args.cable}.npz")), "--out", str(data))
+    for name in ("paper", "drag", "chain"):
+        identify(data, root / name, IDENTIFY[name])
+    identify(data, root / "extended", [*IDENTIFY["extended"], "--base", str(root / "chain")])
+    named = [f"{name}={root / name}" for name in ("paper", "drag")]
+    for seed in SEEDS[: args.seeds]:
+        train(data, root / "extended", root / f"pred{seed}", seed, args.steps)
+        if seed:
+            named.append(f"pred-seed{seed}={root / f'pred{seed}'}")
+    flags = [part for name in [str(root / "pred0"), *named] for part in ("--twin", name)]
+    if args.folds:
+        flags += ["--folds", str(args.folds), "--fold-twins", str(fold_twins(load_dataset(data), root, args.folds))]
+    pred("evaluate", str(data), *flags, "--out", str(root / "evaluation"))
+    return 0
+
+
+def fold_twins(dataset: Dataset, root: Path, folds: int) -> Path:
+    """One extended twin for every fold, identified without the fold's recordings."""
+    twins = root / f"folds{folds}"
+    for number, fold in enumerate(dataset.grouped_folds(folds)):
+        part = root / f"data_fold{number}of{folds}"
+        if not (part / "dataset.yaml").exists():
+            part.mkdir(parents=True, exist_ok=True)
+            for entry in fold.train:
+                link = part / entry.bag
+                if not link.exists():
+                    os.link(dataset.root / entry.bag, link)
+            entries = [dataclasses.replace(e, split="train") for e in fold.train]
+            write_dataset(
+                part, object=dataset.object, rate=dataset.rate, entries=entries, gravity=dataset.gravity,
+                sigma=dataset.sigma, held=dataset.held, known=dataset.known,
+            )  # fmt: skip
+        chain = twins / f"chain{number}"
+        identify(part, chain, IDENTIFY["chain"])
+        identify(part, twins / f"fold{number}", [*IDENTIFY["extended"], "--restarts", "1", "--base", str(chain)])
+    return twins
+
+
+def identify(data: Path, twin: Path, flags: list[str]) -> None:
+    """`pred identify`, unless the twin is there."""
+    if not (twin / "twin.yaml").exists():
+        pred("identify", str(data), "--out", str(twin), *flags)
+
+
+def train(data: Path, twin: Path, out: Path, seed: int, steps: int) -> None:
+    """`pred train`, resumed where it stopped, unless the weights are there."""
+    if not (out / "residual.safetensors").exists():
+        resume = ["--resume"] if (out / "train.checkpoint.safetensors").exists() else []
+        settings = [] if resume else [*TRAIN, "--steps", str(steps), "--seed", str(seed)]
+        pred("train", str(data), "--twin", str(twin), "--out", str(out), *resume, *settings)
+
+
+def pred(*arguments: str) -> None:
+    """Run one `pred` command and stop if it fails."""
+    print("pred " + shlex.join(arguments), flush=True)
+    code = subprocess.run([sys.executable, "-m", "pred_core.cli.main", *arguments], check=False).returncode
+    if code:
+        sys.exit(code)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
