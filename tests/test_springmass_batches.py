@@ -157,3 +157,13 @@ def test_bad_input_is_named() -> None:
         SpringMass(body, [BASE, BASE], extensions=[(drag.extension(coefficient=1.0),), ()])
     with pytest.raises(ConfigError, match="too stiff"):
         SpringMass(line(mass=1e-9), Physics(stiffness=1e5))
+
+
+def test_buffers_of_long_rollouts_are_not_hoarded() -> None:
+    body = line()
+    sim = SpringMass(body, Physics(stiffness=0.1, damping=1e-6), substeps=1)
+    state = sim.start(state_of(np.stack([body.rest_position] * 64)))
+    for periods in range(900, 912):  # 8 MB each, more sizes than are kept
+        sim.rollout(state, nobody(periods))
+    assert sum(work.bytes for work, _, _ in sim._workspaces.values()) <= 1 << 28
+    assert len(sim._workspaces) <= 8

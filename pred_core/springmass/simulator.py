@@ -21,6 +21,7 @@ from pred_core.twin import Extension
 from pred_core.types import Body, Grip, Physics, Scene, State
 
 _KEPT_WORKSPACES = 8
+_KEPT_BYTES = 1 << 28  # of buffers between calls; one call may need more
 
 
 class SpringMass:
@@ -176,7 +177,10 @@ class SpringMass:
         size = Size(worlds, grips.position.shape[0], grips.position.shape[2], len(entries))
         kept = self._workspaces.pop(size, None)
         work = self._new_workspace(size) if kept is None else kept[0]
-        while len(self._workspaces) >= _KEPT_WORKSPACES:
+        while self._workspaces and (
+            len(self._workspaces) >= _KEPT_WORKSPACES
+            or work.bytes + sum(w.bytes for w, _, _ in self._workspaces.values()) > _KEPT_BYTES
+        ):
             del self._workspaces[next(iter(self._workspaces))]
         lines = torch.as_tensor(self._lines, dtype=torch.long)
         bends = torch.as_tensor(self.body.bends, dtype=torch.long).reshape(-1, 3)

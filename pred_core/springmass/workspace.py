@@ -48,6 +48,7 @@ class Workspace:
             "trajectory_out": (size.periods, blocks * lanes, particles, 3),
         }
         self.tensors = {name: torch.zeros(shape, device=device) for name, shape in shapes.items()}
+        self.bytes = sum(tensor.nbytes for tensor in self.tensors.values())
         self.position = self.tensors["position"][:, :, :3]
         self.velocity = self.tensors["velocity"][:, :, :3]
         record = kernel.Worlds()
