@@ -10,7 +10,7 @@ from pred_core.effects.profile import KNOTS, profile
 
 
 class BendingProfile(Effect):
-    """M = (EI/l) p(s) k: bending stiffness EI (1 + p(s))."""
+    """EI -> EI (1 + p(s)/2)^2, positive whatever p: elastic moment, damping and hysteresis scale alike."""
 
     id = "bending_profile"
     family = "bending"
