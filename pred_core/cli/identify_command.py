@@ -14,9 +14,11 @@ from typing import Any, get_type_hints
 from pred_core.bag.dataset import load_dataset
 from pred_core.config import from_mapping
 from pred_core.identify.config import PAPER, IdentifyConfig
-from pred_core.identify.report import write_report
+from pred_core.identify.report import flags, write_report
 from pred_core.identify.run import identify, train_episodes
+from pred_core.identify.space import search_space
 from pred_core.twin import Twin
+from pred_core.types import Physics
 
 NAME = "identify"
 HELP = "fit a twin's physics to the train episodes of a data set (paper III-A)"
@@ -34,23 +36,24 @@ def configure(parser: argparse.ArgumentParser) -> None:
     hints = get_type_hints(IdentifyConfig)
     for field in dataclasses.fields(IdentifyConfig):
         flag = "--" + field.name.replace("_", "-")
-        text = f"{field.metadata['doc']} (default: {_shown(field.default)}{' ' + field.metadata['unit'] if field.metadata['unit'] else ''})"
+        default = f"{_shown(field.default)} {field.metadata['unit']}".strip()
+        text = f"{field.metadata['doc']} (default: {default})".replace("%", "%%")
         if hints[field.name] is bool:
             parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=None, help=text)
         else:
-            parser.add_argument(flag, default=None, metavar="VALUE", help=text.replace("%", "%%"))
+            parser.add_argument(flag, default=None, metavar="VALUE", help=text)
 
 
 def run(args: argparse.Namespace) -> int:
     """Identify, write the twin, `identify.json` and `identify.html`. Interrupted and run again, it goes on."""
     config = _config(args)
+    _check_names(config)
     dataset = load_dataset(args.dataset)
     base = None if args.base is None else Twin.load(args.base)
     show = _Progress()
     journal = args.out / JOURNAL
-    resumed = journal.is_file()
-    if resumed:
-        show(f"going on with the search in {journal}")
+    if journal.is_file():
+        show(f"resuming: going on with the search in {journal}")
     command = shlex.join(["pred", "identify", str(args.dataset), "--out", str(args.out), *_given(args)])
     result = identify(dataset, train_episodes(dataset), config, journal, show, command)
     show.end()
@@ -60,32 +63,39 @@ def run(args: argparse.Namespace) -> int:
     (args.out / "identify.json").write_text(json.dumps(summary, indent=1), encoding="utf-8")
     write_report(args.out / "identify.html", result, command)
     for name, entry in result.values.items():
-        bound = "  AT BOUND" if entry["at_bound"] else ""
-        print(f"{name:32} {entry['value']:.5g} {entry['unit']}{bound}")
+        said = flags(entry)
+        print(f"{name:32} {entry['value']:.5g} {entry['unit']}{f'  ({said})' if said else ''}")
     check = "" if result.held_out_mm is None else f"; {result.held_out_mm:.2f} mm on recordings held out"
     print(f"mean error per coordinate of free particles: {result.fitted_mm:.2f} mm on the best 90 % of episodes{check}")
+    if result.left_out:
+        print(f"left out as outliers, look for damaged tracks: {', '.join(result.left_out)}")
     print(f"wrote {args.out} and {args.out / 'identify.html'} in {result.seconds:.0f} s")
     return 0
 
 
 class _Progress:
-    """One line on stderr: rewritten on a terminal, else printed every two seconds."""
+    """One line on stderr: rewritten on a terminal, else printed when a stage begins and every two seconds."""
 
     def __init__(self) -> None:
         self.terminal = sys.stderr.isatty()
         self.last = 0.0
+        self.stage = ""
 
     def __call__(self, line: str) -> None:
-        now = time.monotonic()
+        now, stage = time.monotonic(), line.split(":", 1)[0]
+        begins = stage != self.stage or stage not in ("search", "refine")
         if self.terminal:
+            if begins:
+                self.end()
             print(f"\r{line:<100}", end="", file=sys.stderr, flush=True)
-        elif now - self.last > QUIET_SECONDS:
+        elif begins or now - self.last > QUIET_SECONDS:
             self.last = now
             print(line, file=sys.stderr, flush=True)
+        self.stage = stage
 
     def end(self) -> None:
         """Leave the line."""
-        if self.terminal:
+        if self.terminal and self.stage:
             print(file=sys.stderr)
 
 
@@ -98,6 +108,11 @@ def _config(args: argparse.Namespace) -> IdentifyConfig:
         if given is not None:
             values[field.name] = given if isinstance(given, bool) else _parsed(given, hints[field.name])
     return from_mapping(IdentifyConfig, values, "pred identify")
+
+
+def _check_names(config: IdentifyConfig) -> None:
+    """Refuse unknown names before bags are read."""
+    search_space(Physics(), config.parameters, config.effects)
 
 
 def _parsed(text: str, hint: Any) -> Any:

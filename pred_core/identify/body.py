@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pred_core.bag.dataset import Dataset
 from pred_core.errors import DatasetError
@@ -30,38 +32,69 @@ class Layout:
 def lay_out(dataset: Dataset, episodes: Sequence[Episode], config: IdentifyConfig) -> Layout:
     """Particles at rest: a line is laid out straight with its median edge lengths, others as first seen.
 
-    Raises: DatasetError if episodes differ in particles or some particle is never seen at a first frame.
+    Raises: DatasetError if episodes differ in particles, or particles that the rest shape needs are not seen.
     """
     ids = episodes[0].tracks.id
     for episode in episodes:
         if not np.array_equal(episode.tracks.id, ids):
             raise DatasetError(
-                f"{episode.name}: particle ids differ from {episodes[0].name}", got=f"{len(episode.tracks.id)} particles",
-                allowed=f"{len(ids)}", next_step="Split the data set by object",
+                f"{episode.name}: particle ids differ from {episodes[0].name}",
+                got=_ids(episode.tracks.id),
+                allowed=_ids(ids),
+                next_step="Split the data set by object",
             )
     kind = dataset.object.kind
-    if kind == "line":
-        lengths = np.concatenate([np.linalg.norm(np.diff(e.position, axis=1), axis=2) for e in episodes])
-        edges = np.nanmedian(lengths, axis=0)
-        rest = np.zeros((len(ids), 3))
-        rest[1:, 0] = np.cumsum(edges)
-    else:
-        rest, edges = episodes[0].position[0].copy(), None
-    if not np.isfinite(rest).all():
-        raise DatasetError(f"{episodes[0].name}: a particle is not seen at the first frame",
-                           next_step="Start the data set with an episode whose first frame shows every particle")
+    edges = _edges(episodes) if kind == "line" else None
+    rest = _first_shape(episodes) if edges is None else _straight(edges)
     spacing = _neighbour_distances(rest)
     shortest = 1.001 * float(edges.max() if edges is not None else spacing.max())
     mass = dataset.known.get("mass")
     physics = dataclasses.replace(Physics(), connection_threshold=shortest, max_springs=2 if edges is not None else 8)
-    body = build_body(
-        kind, rest, float(mass or config.mass), physics, id=ids, rest_length=edges, radius=config.radius
-    )
+    body = build_body(kind, rest, float(mass or config.mass), physics, id=ids, rest_length=edges, radius=config.radius)
     scene = Scene(gravity=dataset.gravity, ground=config.ground)
     return Layout(body, scene, shortest, max(WIDEST * float(np.median(spacing)), 1.01 * shortest), mass is not None)
 
 
+def _edges(episodes: Sequence[Episode]) -> Array:
+    """(N-1,) [m] median distance of consecutive particles over all frames."""
+    lengths = np.concatenate([np.linalg.norm(np.diff(e.position, axis=1), axis=2) for e in episodes])
+    ids = episodes[0].tracks.id
+    never = np.flatnonzero(~np.isfinite(lengths).any(axis=0))
+    if len(never):
+        raise DatasetError(
+            "neighbours on the line are never seen together",
+            got=", ".join(f"{ids[i]} and {ids[i + 1]}" for i in never[:3].tolist()),
+            next_step="Leave out particles that are not tracked",
+        )
+    return np.asarray(np.nanmedian(lengths, axis=0), dtype=np.float64)
+
+
+def _straight(edges: Array) -> Array:
+    """(N, 3) [m] a line along x with these edges."""
+    rest = np.zeros((len(edges) + 1, 3))
+    rest[1:, 0] = np.cumsum(edges)
+    return rest
+
+
+def _first_shape(episodes: Sequence[Episode]) -> Array:
+    """(N, 3) [m] the first frame of the first episode whose first frame shows every particle."""
+    for episode in episodes:
+        if np.isfinite(episode.position[0]).all():
+            return episode.position[0].copy()
+    unseen = ~np.isfinite(episodes[0].position[0]).all(axis=-1)
+    raise DatasetError(
+        "no episode shows every particle at its first frame, which gives the rest shape",
+        got=f"{episodes[0].name} lacks {_ids(episodes[0].tracks.id[unseen])}",
+        next_step="Record an episode that begins with the object at rest in full view",
+    )
+
+
+def _ids(ids: NDArray[np.uint32]) -> str:
+    shown = ", ".join(map(str, ids[:5].tolist()))
+    return f"{len(ids)} particles ({shown}{', ...' if len(ids) > 5 else ''})"
+
+
 def _neighbour_distances(position: Array) -> Array:
-    distance = np.linalg.norm(position[:, None] - position[None], axis=2)
-    np.fill_diagonal(distance, np.inf)
-    return distance.min(axis=1)
+    """(N,) [m] to the nearest other particle."""
+    distance, _ = cKDTree(position).query(position, k=2)
+    return np.asarray(distance[:, 1], dtype=np.float64)

@@ -21,7 +21,12 @@ class IdentifyConfig:
     evaluations: int = setting(400, low=20, high=100_000, doc="candidates per restart")
     window: float = setting(2.0, unit="s", low=0.05, high=600.0, doc="length of a window of the global search")
     windows: int = setting(24, low=1, high=1000, doc="windows of the global search, fixed for the run")
-    stages: tuple[float, ...] = setting((1.0, 2.5, 1e9), unit="s", doc="window lengths of the refinement, in order")
+    stages: tuple[float, ...] = setting(
+        (1.0, 2.5, 1e9),
+        unit="s",
+        low=0.05,
+        doc="window lengths of the refinement, in order; one longer than the episodes means whole episodes",
+    )
     iterations: int = setting(12, low=0, high=200, doc="refinement steps a stage; 0: CMA-ES alone")
     stride: int = setting(5, low=1, high=1000, doc="frames between the residuals the refinement reads")
     estimate_starts: bool = setting(True, doc="fit starts over several frames instead of two")

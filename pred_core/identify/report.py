@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,43 +19,64 @@ def write_report(path: Path, result: Identified, command: str) -> None:
     """Parameters with spread and sensitivity, restarts, and the error of every episode."""
     page = Page(f"Identification of {result.twin.meta.object.name}")
     page.code(command)
-    check = "" if result.held_out_mm is None else f", {number(result.held_out_mm)} mm on recordings that were not fitted"
+    check = ""
+    if result.held_out_mm is not None:
+        check = f", {number(result.held_out_mm)} mm on recordings that were not fitted"
     page.text(
         f"Mean error per coordinate of free particles, open loop over whole episodes: {number(result.fitted_mm)} mm on "
         f"the best 90 % of the train episodes{check}. Track noise {number(result.noise_mm)} mm. Seed {result.seed}, "
         f"{result.seconds:.0f} s."
     )
     page.heading("Parameters")
-    rows, marks = [], []
-    for name, e in result.values.items():
-        spread, interval = e.get("spread"), e.get("interval")
-        rows.append((
-            name, number(float(e["value"]), 4), str(e["unit"]) or "–", _pair(interval), _pair(spread),  # type: ignore[arg-type]
-            f"{100.0 * float(e['sensitivity']):+.2f} %", "at a bound" if e["at_bound"] else "",  # type: ignore[arg-type]
-        ))  # fmt: skip
-        marks.append("warn" if e["at_bound"] else "")
-    page.table(("parameter", "value", "unit", "95 % interval", "spread over restarts", "loss at 10 % change", ""), rows, marks)
+    header = ("parameter", "value", "unit", "95 % interval", "spread over restarts", "loss at 10 % change", "")
+    marks = ["warn" if flags(e) else "" for e in result.values.values()]
+    page.table(header, [_row(n, e) for n, e in result.values.items()], marks)
     page.text(
-        "A loss that hardly changes when a parameter moves by 10 % means that these data do not show it. The interval "
-        "is local and takes episodes as independent; adjacent windows of one recording are not.", note=True,
+        "Where a change of 10 % changes the loss by less than 0.1 %, these data do not show the parameter: any value "
+        "near it predicts as well, and no interval is given. Intervals are local: they come from the slopes at the "
+        "optimum with recordings as independent clusters, and say nothing of other optima or of what the model lacks.",
+        note=True,
     )
     for note in result.twin.meta.notes:
         page.text(note, note=True)
     page.heading("Restarts of the global search")
     names = [k for k in result.restarts[0] if k not in ("seed", "loss_mm")]
-    table = [[r["seed"], number(float(str(r["loss_mm"]))), *(number(float(str(r[n]))) for n in names)] for r in result.restarts]
-    page.table(("seed", "loss [mm]", *names), table)
+    rows = [[r["seed"], number(r["loss_mm"]), *(number(r[n]) for n in names)] for r in result.restarts]
+    page.table(("seed", "loss [mm]", *names), rows)
     page.heading("Error of every train episode")
     page.figure(_episodes(result), "Mean error per coordinate of free particles over the whole episode, open loop.")
     if result.left_out:
-        page.text(f"Left out of the last refinement as outliers (above twice the median): {', '.join(result.left_out)}.")
+        page.text(
+            f"Left out of the last refinement as outliers (above twice the median): {', '.join(result.left_out)}. "
+            "Look for swapped or slipping markers there."
+        )
     page.write(path)
 
 
-def _pair(values: object) -> str:
-    if not isinstance(values, list):
-        return "–"
-    return f"{number(float(values[0]))} to {number(float(values[1]))}"
+def flags(entry: dict[str, Any]) -> str:
+    """What a reader must know of a parameter's value; empty if nothing."""
+    said = []
+    if entry["at_bound"]:
+        said.append("at a bound")
+    if not entry["identifiable"]:
+        said.append("not identifiable from these data")
+    return ", ".join(said)
+
+
+def _row(name: str, entry: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        name,
+        number(float(entry["value"]), 4),
+        entry["unit"] or "–",
+        _pair(entry.get("interval")),
+        _pair(entry.get("spread")),
+        f"{100.0 * entry['sensitivity']:+.2f} %",
+        flags(entry),
+    )
+
+
+def _pair(values: list[float] | None) -> str:
+    return "–" if values is None else f"{number(values[0])} to {number(values[1])}"
 
 
 def _episodes(result: Identified) -> Figure:

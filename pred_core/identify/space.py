@@ -10,6 +10,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from pred_core.types import Array, Physics
 
 WIDEST_VECTOR = 3  # components; a longer parameter is a profile
 LOG_STEPS = 6.0  # PhysTwin's choice: a first step is a sixth of the range
+DISCRETE = ("connection_threshold", "max_springs")  # steps, not slopes: not for a local refinement
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class Knob:
     def at_bound(self, value: float) -> bool:
         """Whether a value sits on a bound, to a thousandth of the range."""
         z, low, high = (self.coordinate(v) for v in (value, self.low, self.high))
-        return min(z - low, high - z) < 1e-3 * (high - low)
+        return bool(min(z - low, high - z) < 1e-3 * (high - low))
 
 
 @dataclass(frozen=True)
@@ -79,18 +81,17 @@ class SearchSpace:
 
     def candidate(self, z: Sequence[float] | Array) -> Candidate:
         """The point at coordinates z."""
-        physics, extensions = self.physics, {e.id: {k: list(v) for k, v in e.parameters.items()} for e in self.extensions}
+        physics: dict[str, Any] = dataclasses.asdict(self.physics)
+        extensions = {e.id: {k: list(v) for k, v in e.parameters.items()} for e in self.extensions}
         for knob, coordinate in zip(self.knobs, z, strict=True):
             value = knob.value(float(coordinate))
             if "." in knob.name:
-                effect, rest = knob.name.split(".", 1)
-                parameter, index = rest[:-1].split("[")
-                extensions[effect][parameter][int(index)] = value
+                effect, parameter, index = _address(knob.name)
+                extensions[effect][parameter][index] = value
             else:
-                whole = isinstance(getattr(Physics, knob.name), int)
-                physics = dataclasses.replace(physics, **{knob.name: round(value) if whole else value})
+                physics[knob.name] = round(value) if isinstance(physics[knob.name], int) else value
         return Candidate(
-            physics,
+            Physics(**physics),
             tuple(
                 dataclasses.replace(e, parameters={k: tuple(v) for k, v in extensions[e.id].items()})
                 for e in self.extensions
@@ -112,10 +113,14 @@ def search_space(
 ) -> SearchSpace:
     """Knobs for the named Physics fields and for every parameter of the named effects.
 
-    Effects not among `extensions` start at their null values. Raises: ConfigError for an unknown name.
+    Effects not among `extensions` start at their null values. Raises: ConfigError for an unknown or repeated name,
+    TwinError for an unknown effect.
     """
     fields = {f.name: f for f in dataclasses.fields(Physics)}
     knobs = []
+    for name in [*names, *effects]:
+        if [*names, *effects].count(name) > 1:
+            raise ConfigError(f"'{name}' is given twice", allowed="each parameter and effect once")
     for name in names:
         if name not in fields:
             raise ConfigError(f"unknown parameter '{name}'", next_step=nearest(name, fields))
@@ -129,11 +134,13 @@ def search_space(
                 value = present[id].parameters[q.name][k]
                 start = max(value, q.low) if q.log else value
                 profile = q.size > WIDEST_VECTOR or bool(q.starts)
-                knobs.append(Knob(f"{id}.{q.name}[{k}]", q.unit, q.low, q.high, q.log, start, q.typical, profile, q.starts))
+                knobs.append(
+                    Knob(f"{id}.{q.name}[{k}]", q.unit, q.low, q.high, q.log, start, q.typical, profile, q.starts)
+                )
     return SearchSpace(tuple(knobs), physics, tuple(present.values()))
 
 
-def _physics_knob(field: dataclasses.Field, value: float) -> Knob:  # type: ignore[type-arg]
+def _physics_knob(field: dataclasses.Field[Any], value: float) -> Knob:
     m = field.metadata
     low = m["low"] if m["floor"] is None else m["floor"]
     if m["log"]:
@@ -144,8 +151,16 @@ def _physics_knob(field: dataclasses.Field, value: float) -> Knob:  # type: igno
 
 def _moved(knob: Knob, candidate: Candidate) -> Knob:
     if "." not in knob.name:
-        return dataclasses.replace(knob, start=float(getattr(candidate.physics, knob.name)))
-    effect, rest = knob.name.split(".", 1)
+        value = float(getattr(candidate.physics, knob.name))
+    else:
+        effect, parameter, index = _address(knob.name)
+        value = next(e for e in candidate.extensions if e.id == effect).parameters[parameter][index]
+    # A logarithmic knob cannot start at zero.
+    return dataclasses.replace(knob, start=max(value, knob.low) if knob.log else value)
+
+
+def _address(name: str) -> tuple[str, str, int]:
+    """`effect.parameter[k]` as (effect, parameter, k)."""
+    effect, rest = name.split(".", 1)
     parameter, index = rest[:-1].split("[")
-    extension = next(e for e in candidate.extensions if e.id == effect)
-    return dataclasses.replace(knob, start=extension.parameters[parameter][int(index)])
+    return effect, parameter, int(index)

@@ -1,0 +1,128 @@
+"""The stages of one identification: global search, local refinement, held-out check."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from pred_core.identify.body import Layout
+from pred_core.identify.config import IdentifyConfig
+from pred_core.identify.journal import Journal
+from pred_core.identify.problem import Problem
+from pred_core.identify.refine import Refined, refine
+from pred_core.identify.search import Restart, search, trimmed
+from pred_core.identify.space import DISCRETE, Candidate, SearchSpace
+from pred_core.identify.topology import Topology
+from pred_core.identify.windows import draw_windows, make_windows
+from pred_core.springmass.stability import MOST_SUBSTEPS
+from pred_core.train.recordings import Recording
+from pred_core.types import Body, Physics
+
+Tell = Callable[[str], None]
+MOST_WINDOWS = 64  # of a refinement stage shorter than an episode
+
+
+@dataclass(frozen=True)
+class Stages:
+    """What every stage shares. `noise` [m]: window starts are estimated with it; None: raw from two frames."""
+
+    layout: Layout
+    topology: Topology | None  # the union of springs, if their rule is searched at all
+    period: float  # [s]
+    noise: float | None
+    config: IdentifyConfig
+    tell: Tell
+
+    def problem(
+        self,
+        recordings: Sequence[Recording],
+        seconds: float,
+        *,
+        count: int | None = None,
+        body: Body | None = None,
+        topology: Topology | None = None,
+    ) -> Problem:
+        """Windows of `seconds` over the recordings; whole recordings where they are shorter."""
+        longest = max(len(r.position) for r in recordings) - 2
+        steps = min(round(min(seconds, 1e6) / self.period), longest)
+        most = count or max(MOST_WINDOWS, len(recordings))
+        index = draw_windows(recordings, steps, most, torch.Generator().manual_seed(self.config.seed))
+        windows = make_windows(recordings, index, steps, self.period, self.noise)
+        c = self.config
+        return Problem(body or self.layout.body, self.layout.scene, self.period, windows, c.substeps, topology)
+
+    def whole(self, recordings: Sequence[Recording]) -> Problem:
+        """The longest windows, with all springs that were searched and no bound on stiffness: to judge with."""
+        problem = self.problem(recordings, self.config.stages[-1], topology=self.topology)
+        problem.most_substeps = MOST_SUBSTEPS
+        return problem
+
+    def body(self, physics: Physics) -> Body:
+        """The body with the springs these parameters make."""
+        return self.layout.body if self.topology is None else self.topology.body(physics)
+
+    def search(self, recordings: Sequence[Recording], space: SearchSpace, journal: Journal) -> list[Restart]:
+        """The global search."""
+        c = self.config
+        problem = self.problem(recordings, c.window, count=c.windows, topology=self.topology)
+        self.tell(f"search: {len(space.knobs)} parameters, {problem.windows.count} windows of {c.window:g} s")
+        begin = time.monotonic()
+
+        def report(done: int, planned: int, loss: float) -> None:
+            fresh = done - journal.replayed
+            line = f"search: {done}/{planned} candidates, best {1e3 * loss:.2f} mm"
+            if fresh > 0:
+                line += f", at most {(time.monotonic() - begin) / fresh * (planned - done):.0f} s left"
+            self.tell(line)
+
+        seeds = [c.seed + k for k in range(c.restarts)]
+        return search(problem, space, seeds=seeds, evaluations=c.evaluations, journal=journal, report=report)
+
+    def refine(
+        self, recordings: Sequence[Recording], space: SearchSpace, start: Candidate, seconds: Sequence[float]
+    ) -> tuple[Candidate, Refined | None]:
+        """The local refinement of everything continuous, over windows of these lengths in order.
+
+        Knobs with several starts are tried from each through all lengths but the last; the best goes on.
+        """
+        knobs = tuple(k for k in space.knobs if k.name not in DISCRETE)
+        if self.config.iterations == 0 or not knobs:
+            return start, None
+        local = SearchSpace(knobs, start.physics, start.extensions).at(start)
+        trials = [start]
+        for n, knob in enumerate(local.knobs):
+            for value in knob.starts if len(seconds) > 1 else ():
+                z = local.start()
+                z[n] = knob.coordinate(value)
+                trials.append(local.candidate(z))
+        ends = [self._lengths(recordings, local, trial, seconds[:-1]) for trial in trials]
+        best = min(ends, key=lambda end: np.inf if end[1] is None else end[1].loss)
+        return self._lengths(recordings, local, best[0], seconds[-1:])
+
+    def _lengths(
+        self, recordings: Sequence[Recording], space: SearchSpace, start: Candidate, seconds: Sequence[float]
+    ) -> tuple[Candidate, Refined | None]:
+        refined = None
+        for length in seconds:
+            problem = self.problem(recordings, length, body=self.body(start.physics))
+            local = space.at(start)
+            steps = len(problem.windows.target)
+            title = f"refine: {problem.windows.count} windows of {steps * self.period:.1f} s"
+
+            def report(done: int, planned: int, loss: float, title: str = title) -> None:
+                self.tell(f"{title}, step {done}/{planned}, {1e3 * loss:.3f} mm")
+
+            stride = min(self.config.stride, steps)
+            refined = refine(problem, local, local.start(), self.config.iterations, stride, report)
+            start = local.candidate(refined.z)
+        return start, refined
+
+    def check(self, candidate: Candidate, recordings: Sequence[Recording], stage: str) -> float:
+        """Error [mm] on recordings that were not fitted."""
+        error = 1e3 * float(trimmed(self.whole(recordings).losses([candidate]))[0])
+        self.tell(f"held-out check ({stage}): {error:.2f} mm on {len(recordings)} episodes not fitted")
+        return error
