@@ -20,8 +20,11 @@ class BendingHysteresis(Effect):
     family = "internal loss"
     hooks = ("bend",)
     parameters = (
-        Parameter("ratio", "1", 0.0, 20.0, typical=1.0, starts=(2.0,), doc="a, friction stiffness over bending stiffness"),
-        Parameter("reach", "1", 1e-3, 3.0, null=0.1, typical=0.7, log=True, starts=(0.3,), doc="c, curvature at which it slips"),
+        Parameter("ratio", "1", 0.0, 20.0, typical=1.0, starts=(2.0,), doc="a, friction stiffness over EI/l"),
+        Parameter(
+            "reach", "1", 1e-3, 3.0, null=0.1, typical=0.7, log=True, starts=(0.09,),
+            doc="c, curvature (2 tan of half the angle) at which it slips"
+        ),
     )
     confounded_with = ("bending_damping", "rest_curvature")
     bend_memory = 2

@@ -31,7 +31,7 @@ class Parameter:
     size: int = 1
     typical: float = 0.1  # how much of it matters: the first step of a search
     log: bool = False  # positive, searched on a log scale
-    starts: tuple[float, ...] = ()  # values a refinement starts from besides the present one (many optima)
+    starts: tuple[float, ...] = ()  # refined, not searched globally: where a refinement starts, and what else it tries
     doc: str = ""
 
 

@@ -10,10 +10,11 @@ import numpy as np
 from scipy.stats import t as student
 
 from pred_core.identify.problem import Problem
-from pred_core.identify.refine import SOFTNESS, STEP, kept
+from pred_core.identify.refine import SOFTNESS, kept
 from pred_core.identify.space import SearchSpace
 
 LEVEL = 0.95
+STEP = 0.01  # finite difference, in coordinates: 2 % of a stiffness
 
 
 def half_widths(problem: Problem, space: SearchSpace, stride: int) -> list[float | None]:

@@ -46,6 +46,7 @@ class Problem:
     ):
         self.body, self.scene, self.period, self.windows = body, scene, period, windows
         self.most_substeps, self.topology = most_substeps, topology
+        self.room = 1.0  # how far beyond `most_substeps` a candidate may ask and be simulated with those
         always = (windows.start.held >= 0).all(dim=0) & (windows.held >= 0).flatten(0, 1).all(dim=0)
         self.held: NDArray[np.bool_] = always.numpy()  # (N,) particles that never move freely
         free = np.flatnonzero(~self.held)
@@ -69,7 +70,9 @@ class Problem:
     def substeps(self, candidate: Candidate) -> int:
         """What this candidate is simulated with, a rung; what it needs if that is beyond `most_substeps`."""
         needed = self.needed(candidate)
-        return needed if needed > self.most_substeps else min(next(r for r in RUNGS if r >= needed), self.most_substeps)
+        if needed > self.room * self.most_substeps:
+            return needed
+        return min(next(r for r in RUNGS if r >= needed), self.most_substeps)
 
     def losses(self, candidates: Sequence[Candidate], substeps: int | None = None) -> Array:
         """(C, W) mean absolute error per coordinate [m] of free particles, over the window.

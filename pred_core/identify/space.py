@@ -36,7 +36,8 @@ class Knob:
     start: float
     scale: float
     profile: bool = False  # a coefficient of a profile, or an angle with many optima: refined, not searched globally
-    starts: tuple[float, ...] = ()  # other values a refinement starts from
+    starts: tuple[float, ...] = ()  # where a refinement starts if the parameter is off; the others are tried too
+    null: float = 0.0  # the value that is off
 
     def value(self, z: float) -> float:
         """The parameter's value, inside its bounds."""
@@ -135,7 +136,7 @@ def search_space(
                 start = max(value, q.low) if q.log else value
                 profile = q.size > WIDEST_VECTOR or bool(q.starts)
                 knobs.append(
-                    Knob(f"{id}.{q.name}[{k}]", q.unit, q.low, q.high, q.log, start, q.typical, profile, q.starts)
+                    Knob(f"{id}.{q.name}[{k}]", q.unit, q.low, q.high, q.log, start, q.typical, profile, q.starts, q.null)
                 )
     return SearchSpace(tuple(knobs), physics, tuple(present.values()))
 

@@ -23,7 +23,10 @@ from pred_core.train.recordings import Recording
 from pred_core.types import Body, Physics
 
 Tell = Callable[[str], None]
-MOST_WINDOWS = 64  # of a refinement stage shorter than an episode
+MOST_WINDOWS = 112  # of a refinement stage shorter than an episode
+# Substeps are chosen at half the stability limit. A search that ends there may be refined beyond, still stable: at the
+# wall every small step would be charged and nothing could move.
+ROOM = 1.7
 
 
 @dataclass(frozen=True)
@@ -87,18 +90,25 @@ class Stages:
     ) -> tuple[Candidate, Refined | None]:
         """The local refinement of everything continuous, over windows of these lengths in order.
 
-        Knobs with several starts are tried from each through all lengths but the last; the best goes on.
+        Knobs that were not searched start at their first start where they are off; each other start of one of them
+        is tried too, through all lengths but the last, and the best goes on.
         """
         knobs = tuple(k for k in space.knobs if k.name not in DISCRETE)
         if self.config.iterations == 0 or not knobs:
             return start, None
         local = SearchSpace(knobs, start.physics, start.extensions).at(start)
         trials = [start]
-        for n, knob in enumerate(local.knobs):
-            for value in knob.starts if len(seconds) > 1 else ():
-                z = local.start()
-                z[n] = knob.coordinate(value)
-                trials.append(local.candidate(z))
+        if len(seconds) > 1:
+            first = local.start()
+            for n, knob in enumerate(local.knobs):
+                if knob.starts and knob.start == knob.null:
+                    first[n] = knob.coordinate(knob.starts[0])
+            trials = [local.candidate(first)]
+            for n, knob in enumerate(local.knobs):
+                for value in knob.starts[1:]:
+                    z = first.copy()
+                    z[n] = knob.coordinate(value)
+                    trials.append(local.candidate(z))
         ends = [self._lengths(recordings, local, trial, seconds[:-1]) for trial in trials]
         best = min(ends, key=lambda end: np.inf if end[1] is None else end[1].loss)
         return self._lengths(recordings, local, best[0], seconds[-1:])
@@ -109,6 +119,7 @@ class Stages:
         refined = None
         for length in seconds:
             problem = self.problem(recordings, length, body=self.body(start.physics))
+            problem.room = ROOM
             local = space.at(start)
             steps = len(problem.windows.target)
             title = f"refine: {problem.windows.count} windows of {steps * self.period:.1f} s"

@@ -19,6 +19,7 @@ from pred_core.train.recordings import Recording
 from pred_core.types import Array
 
 WIDEST = 6  # frames on each side
+FINEST = 1e-6  # [m] what float32 tracks resolve; three frames always fit, which is the central difference
 CALM = 0.1  # share of the frames the noise is read from
 
 
@@ -44,7 +45,7 @@ def estimate_start(recording: Recording, frame: int, period: float, noise: float
     """(position (N, 3) [m], velocity (N, 3) [m/s]) at `frame`.
 
     Each free particle takes the widest window whose quadratic fits within twice the noise (Lepski's rule). Without
-    clean frames around: backward difference. Held particles sit where they are in their gripper on average.
+    clean frames around: backward difference, which lags half a period behind. Held particles sit where they are in their gripper on average.
     """
     measured = recording.position[frame].double().numpy()
     position, velocity = measured.copy(), (measured - recording.position[frame - 1].double().numpy()) / period
@@ -58,7 +59,7 @@ def estimate_start(recording: Recording, frame: int, period: float, noise: float
         if not np.isfinite(span).all():
             break
         fit, error = _quadratic(span)
-        good = ~settled & (error <= 2.0 * noise)
+        good = ~settled & (error <= 2.0 * max(noise, FINEST))
         position[good], velocity[good] = fit[0][good], fit[1][good] / period
         settled |= ~good
     if held.any():
