@@ -25,10 +25,10 @@ IDENTIFY = {
     "paper": ["--paper"],
     "drag": ["--effects", "drag_linear"],
     "chain": ["--effects", "bending_damping", "--parameters", CONTINUOUS],
-    "extended": ["--effects", EFFECTS, "--parameters", CONTINUOUS, "--stages", "1.0,1e9", "--restarts", "2"],
+    "extended": ["--effects", EFFECTS, "--parameters", CONTINUOUS, "--restarts", "2"],
 }
 TRAIN = shlex.split(
-    "--gradient detached --carry 124 --rollout 4 --loss smooth --beta 0.3 --cap 0.02 --penalty 0.3 "
+    "--no-azimuth --gradient detached --carry 124 --rollout 4 --loss smooth --beta 0.3 --cap 0.02 --penalty 0.3 "
     "--learning-rate 1e-3 --average 0.995 --arc-frequencies 3 --encoder-layers 2 --feature 32 --embedding 32 --feedforward 64 "
     "--encoder-feedforward 64 --outlier 2"
 )
@@ -42,7 +42,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("out/cables"))
     parser.add_argument("--folds", type=int, default=0, help="also identify for every fold of a grouped split")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of the residual network to train")
-    parser.add_argument("--steps", type=int, default=2500, help="training steps of the residual network")
+    parser.add_argument("--steps", type=int, default=3000, help="training steps of the residual network")
     args = parser.parse_args()
     root = args.out / args.cable
     data = root / "data"
@@ -81,7 +81,7 @@ def fold_twins(dataset: Dataset, root: Path, folds: int) -> Path:
             )  # fmt: skip
         chain = twins / f"chain{number}"
         identify(part, chain, IDENTIFY["chain"])
-        identify(part, twins / f"fold{number}", [*IDENTIFY["extended"], "--restarts", "1", "--base", str(chain)])
+        identify(part, twins / f"fold{number}", [*IDENTIFY["extended"], "--stages", "1.0,1e9", "--base", str(chain)])
     return twins
 
 
