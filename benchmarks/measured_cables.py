@@ -29,8 +29,8 @@ IDENTIFY = {
 }
 TRAIN = shlex.split(
     "--no-azimuth --gradient detached --carry 124 --rollout 4 --loss smooth --beta 0.3 --cap 0.02 --penalty 0.3 "
-    "--learning-rate 1e-3 --average 0.995 --arc-frequencies 3 --encoder-layers 2 --feature 32 --embedding 32 --feedforward 64 "
-    "--encoder-feedforward 64 --outlier 2"
+    "--learning-rate 1e-3 --average 0.995 --outlier 2 --arc-frequencies 3 --encoder-layers 2 --feature 32 "
+    "--embedding 32 --feedforward 64 --encoder-feedforward 64"
 )
 SEEDS = (0, 1, 2)
 

@@ -206,7 +206,7 @@ def _load_extensions(path: Path) -> tuple[Extension, ...]:
             for e in entries
         )
     except (TypeError, KeyError, ValueError, AttributeError) as error:
-        raise TwinError(f"{path}: an entry is malformed", got=error, allowed="id, version, parameters, evidence") from error
+        raise TwinError(f"{path}: malformed entry", got=error, allowed="id, version, parameters, evidence") from error
 
 
 def _load_residual(path: Path) -> ResidualWeights | None:
