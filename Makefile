@@ -1,6 +1,7 @@
 # make run    the main job: measured cable -> ROS 2 topics -> prediction -> score and report
 #             (make run ARGS="--factor 2 --episodes 14"; ARGS=--help lists them)
 # make test   set-up, lint, tests            make bench  the benchmarks
+# make cables every number of the measured cables and the twins that ship (half an hour)
 # make lint   ruff and mypy                  make clean  remove what was built (out/ and data/ stay)
 
 VENV := .venv
@@ -12,7 +13,7 @@ EXTRAS := ros,vision,plant,hardware,dev
 PYTHON ?= $(shell for p in python3.11 python3.12 python3 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' >/dev/null 2>&1 && echo $$p && break; done)
 
-.PHONY: run test bench lint setup clean
+.PHONY: run test bench cables lint setup clean
 
 setup: $(STAMP)
 
@@ -33,7 +34,11 @@ lint: $(STAMP)
 	$(BIN)/mypy pred_core pred_ros
 
 bench: $(STAMP)
-	@set -e; for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script; done
+	@set -e; for script in $(filter-out benchmarks/measured_cables.py,$(wildcard benchmarks/*.py)); do \
+		echo "== $$script"; $(BIN)/python $$script; done
+
+cables: $(STAMP)
+	@set -e; for cable in dlo1 dlo2; do $(BIN)/python benchmarks/measured_cables.py $$cable --out out/cables; done
 
 clean:
 	rm -rf $(VENV) build install log *.egg-info .pytest_cache .ruff_cache .mypy_cache
