@@ -20,8 +20,8 @@ class RestCurvature(Effect):
     family = "bending"
     hooks = ("bend",)
     parameters = (
-        Parameter("first", "1", -5.0, 5.0, size=KNOTS, typical=0.05, doc="k0 along the first axis, at knots"),
-        Parameter("second", "1", -5.0, 5.0, size=KNOTS, typical=0.05, doc="k0 along the second axis, at knots"),
+        Parameter("first", "1", -5.0, 5.0, size=KNOTS, typical=0.15, doc="k0 along the first axis, at knots"),
+        Parameter("second", "1", -5.0, 5.0, size=KNOTS, typical=0.15, doc="k0 along the second axis, at knots"),
         Parameter(
             "twist", "rad", -4.0, 4.0, typical=0.3, starts=(0.0, -1.57, 1.57, 3.14),
             doc="angle of the material in the last gripper against the first, untwisted"

@@ -40,9 +40,11 @@ def write_report(path: Path, result: Identified, command: str) -> None:
     for note in result.twin.meta.notes:
         page.text(note, note=True)
     page.heading("Restarts of the global search")
-    names = [k for k in result.restarts[0] if k not in ("seed", "loss_mm")]
-    rows = [[r["seed"], number(r["loss_mm"]), *(number(r[n]) for n in names)] for r in result.restarts]
-    page.table(("seed", "loss [mm]", *names), rows)
+    names = [k for k in result.restarts[0] if k not in ("seed", "loss_mm", "evaluations")]
+    rows = []
+    for r in result.restarts:
+        rows.append([r["seed"], r["evaluations"], number(r["loss_mm"]), *(number(r[n]) for n in names)])
+    page.table(("seed", "candidates", "loss [mm]", *names), rows)
     page.heading("Error of every train episode")
     page.figure(_episodes(result), "Mean error per coordinate of free particles over the whole episode, open loop.")
     if result.left_out:

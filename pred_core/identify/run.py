@@ -12,20 +12,17 @@ import numpy as np
 import torch
 
 from pred_core.bag.dataset import Dataset
-from pred_core.errors import ConfigError
-from pred_core.identify.body import Layout, lay_out
 from pred_core.identify.config import IdentifyConfig
 from pred_core.identify.evidence import Values, gather_evidence
 from pred_core.identify.journal import Journal
+from pred_core.identify.prepare import prepare
 from pred_core.identify.refine import OUTLIER
 from pred_core.identify.search import trimmed
-from pred_core.identify.space import DISCRETE, Candidate, SearchSpace, search_space
-from pred_core.identify.stages import Stages, Tell
-from pred_core.identify.starts import track_noise
-from pred_core.identify.topology import Topology
-from pred_core.train.recordings import Recording, align, split_groups
+from pred_core.identify.space import Candidate
+from pred_core.identify.stages import Tell
+from pred_core.train.recordings import Recording, split_groups
 from pred_core.twin import Extension, Twin, TwinMeta
-from pred_core.types import Array, Episode, Physics
+from pred_core.types import Array, Episode
 
 
 @dataclass(frozen=True)
@@ -70,23 +67,14 @@ def identify(
     Raises: DatasetError or ConfigError on unusable data or settings.
     """
     begin = time.monotonic()
-    if not config.stages:
-        raise ConfigError("stages", got="none", allowed="at least one window length [s]")
-    layout = lay_out(dataset, episodes, config)
-    space, notes = _space(layout, config)
-    period = float(np.median([e.period for e in episodes]))
-    recordings = [align(e, layout.body, period) for e in episodes]
-    _check_lengths(recordings, period, config)
+    prepared = prepare(dataset, episodes, config, tell)
+    stages, space, recordings, notes = prepared.stages, prepared.space, prepared.recordings, list(prepared.notes)
     fitted, held_out = _split(recordings, config)
     if config.hold_out > 0 and not held_out:
         notes.append("one recording only: nothing is held out, the error is that of the fit")
-    if not layout.mass_known:
-        notes.append(f"mass is nominal ({config.mass:g} kg): motion alone does not show it")
     for note in notes:
         tell(f"note: {note}")
-    noise = dataset.sigma if dataset.sigma is not None else track_noise(recordings)
-    stages = Stages(layout, _topology(layout, config), period, noise if config.estimate_starts else None, config, tell)
-    searched = SearchSpace(tuple(k for k in space.knobs if not k.profile), space.physics, space.extensions)
+    searched = space.coarse()
     hashes = tuple(dataset.sha256(e) for e in dataset.select("train"))
 
     journal = Journal(journal_path, {"config": repr(config), "data": hashes, "object": repr(dataset.object)})
@@ -105,7 +93,7 @@ def identify(
     values = gather_evidence(problem, space, searched, best, restarts, stride, config.substeps)
     meta = TwinMeta(
         object=dataset.object,
-        period=period,
+        period=stages.period,
         substeps=substeps,
         created_by=command,
         data=hashes,
@@ -116,15 +104,23 @@ def identify(
     bad = tuple(n for n, v in errors.items() if v > OUTLIER * np.median(list(errors.values())))
     return Identified(
         twin=Twin(
-            meta, stages.body(best.physics), best.physics, layout.scene, _with_evidence(best, values), None, report
+            meta=meta,
+            body=stages.body(best.physics),
+            physics=best.physics,
+            scene=stages.layout.scene,
+            extensions=_with_evidence(best, values),
+            physics_report=report,
         ),
         values=values,
-        restarts=[{"seed": r.seed, "loss_mm": 1e3 * r.loss, **searched.values(r.z)} for r in restarts],
+        restarts=[
+            {"seed": r.seed, "loss_mm": 1e3 * r.loss, "evaluations": r.evaluations, **searched.values(r.z)}
+            for r in restarts
+        ],
         fitted_mm=1e3 * float(trimmed(losses[None])[0]),
         held_out_mm=check,
         windows=errors,
         left_out=bad if refined is None else refined.left_out,
-        noise_mm=1e3 * noise,
+        noise_mm=1e3 * prepared.noise,
         seconds=time.monotonic() - begin,
         seed=config.seed,
     )
@@ -135,57 +131,10 @@ def train_episodes(dataset: Dataset) -> list[Episode]:
     return list(dataset.episodes("train"))
 
 
-def _check_lengths(recordings: Sequence[Recording], period: float, config: IdentifyConfig) -> None:
-    longest = (max(len(r.position) for r in recordings) - 2) * period
-    if config.window > longest + 0.5 * period:
-        raise ConfigError(
-            "window",
-            got=f"{config.window:g} s",
-            allowed=f"at most {longest:.4g} s, what the longest recording holds after its first two frames",
-            next_step="Give a shorter --window",
-        )
-
-
 def _split(recordings: list[Recording], config: IdentifyConfig) -> tuple[list[Recording], list[Recording]]:
     if config.hold_out == 0 or len({r.group for r in recordings}) == 1:
         return recordings, []
     return split_groups(recordings, config.hold_out, torch.Generator().manual_seed(config.seed))
-
-
-def _topology(layout: Layout, config: IdentifyConfig) -> Topology | None:
-    if not set(DISCRETE) & set(config.parameters):
-        return None
-    return Topology(layout.body, layout.longest, 8 if layout.body.kind == "line" else 24)
-
-
-def _space(layout: Layout, config: IdentifyConfig) -> tuple[SearchSpace, list[str]]:
-    """Knobs with the connection rule bounded by the object's own spacing, and notes on what cannot be searched."""
-    line = layout.body.kind == "line"
-    names, notes = list(config.parameters), []
-    if "ground_friction" in names and layout.scene.ground is None:
-        names.remove("ground_friction")
-        notes.append("ground_friction is not searched: no ground is given (--ground)")
-    if "bending_stiffness" in names and not len(layout.body.bends):
-        names.remove("bending_stiffness")
-        notes.append("bending_stiffness is not searched: the object has no straight runs of springs")
-    physics = Physics(
-        connection_threshold=layout.shortest,
-        max_springs=2 if line else 8,
-        bending_stiffness=1e-3 if "bending_stiffness" in names else 0.0,
-    )
-    space = search_space(physics, names, config.effects)
-    if not space.knobs:
-        raise ConfigError("nothing to search", got="; ".join(notes) or "no --parameters and no --effects")
-    knobs = []
-    for knob in space.knobs:
-        if knob.name == "connection_threshold":
-            scale = float(np.log(layout.longest / layout.shortest)) / 6.0
-            knob = dataclasses.replace(knob, low=layout.shortest, high=layout.longest, scale=scale)
-        if knob.name == "max_springs":
-            low, high = (2, 8) if line else (4, 24)
-            knob = dataclasses.replace(knob, low=low, high=high, scale=2.0)
-        knobs.append(knob)
-    return SearchSpace(tuple(knobs), space.physics, space.extensions), notes
 
 
 def _with_evidence(candidate: Candidate, values: Values) -> tuple[Extension, ...]:

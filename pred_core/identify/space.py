@@ -72,6 +72,19 @@ class SearchSpace:
     physics: Physics
     extensions: tuple[Extension, ...] = ()
 
+    def coarse(self) -> SearchSpace:
+        """What a global search moves: no profiles; parameters that are only refined act at their first start."""
+        extensions = []
+        for e in self.extensions:
+            values = {name: list(v) for name, v in e.parameters.items()}
+            for knob in self.knobs:
+                effect, _, rest = knob.name.partition(".")
+                if effect == e.id and knob.starts and knob.start == knob.null:
+                    parameter, index = rest[:-1].split("[")
+                    values[parameter][int(index)] = knob.starts[0]
+            extensions.append(dataclasses.replace(e, parameters={k: tuple(v) for k, v in values.items()}))
+        return SearchSpace(tuple(k for k in self.knobs if not k.profile), self.physics, tuple(extensions))
+
     def bounds(self) -> tuple[list[float], list[float]]:
         """(lower, upper) coordinates."""
         return [k.coordinate(k.low) for k in self.knobs], [k.coordinate(k.high) for k in self.knobs]
@@ -135,9 +148,8 @@ def search_space(
                 value = present[id].parameters[q.name][k]
                 start = max(value, q.low) if q.log else value
                 profile = q.size > WIDEST_VECTOR or bool(q.starts)
-                knobs.append(
-                    Knob(f"{id}.{q.name}[{k}]", q.unit, q.low, q.high, q.log, start, q.typical, profile, q.starts, q.null)
-                )
+                name = f"{id}.{q.name}[{k}]"
+                knobs.append(Knob(name, q.unit, q.low, q.high, q.log, start, q.typical, profile, q.starts, q.null))
     return SearchSpace(tuple(knobs), physics, tuple(present.values()))
 
 

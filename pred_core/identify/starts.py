@@ -45,7 +45,8 @@ def estimate_start(recording: Recording, frame: int, period: float, noise: float
     """(position (N, 3) [m], velocity (N, 3) [m/s]) at `frame`.
 
     Each free particle takes the widest window whose quadratic fits within twice the noise (Lepski's rule). Without
-    clean frames around: backward difference, which lags half a period behind. Held particles sit where they are in their gripper on average.
+    clean frames around: backward difference, which lags half a period behind. Held particles sit where they are in
+    their gripper on average.
     """
     measured = recording.position[frame].double().numpy()
     position, velocity = measured.copy(), (measured - recording.position[frame - 1].double().numpy()) / period
