@@ -20,7 +20,7 @@ from pred_core.types import Array
 STEP = 0.05  # finite difference, in coordinates (twentieths of a typical change)
 SOFTNESS = 0.003  # [m] below which an error counts quadratically
 OUTLIER = 2.0  # times the median loss
-RIDGE = 1e-4  # of the mean curvature
+RIDGE = 1e-7  # of the mean curvature; 1e-4 froze profiles of a soft cable
 LONGEST_STEP = 3.0  # in coordinates, per iteration
 PATIENCE = 7  # times the damping is raised before giving up
 IMPROVEMENT = 5e-4  # relative, below which it has converged
