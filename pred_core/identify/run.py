@@ -19,7 +19,7 @@ from pred_core.identify.prepare import prepare
 from pred_core.identify.refine import OUTLIER
 from pred_core.identify.search import trimmed
 from pred_core.identify.space import Candidate
-from pred_core.identify.stages import Tell
+from pred_core.identify.stages import ROOM, Tell
 from pred_core.train.recordings import Recording, split_groups
 from pred_core.twin import Extension, Twin, TwinMeta
 from pred_core.types import Array, Episode
@@ -90,7 +90,8 @@ def identify(
     substeps = min(problem.substeps(best), config.substeps)
     losses = problem.losses([best], substeps)[0]
     stride = min(config.stride, len(problem.windows.target))
-    values = gather_evidence(problem, space, searched, best, restarts, stride, config.substeps)
+    wall = config.substeps * (1.0 if refined is None else ROOM)
+    values = gather_evidence(problem, space, searched, best, restarts, stride, wall)
     meta = TwinMeta(
         object=dataset.object,
         period=stages.period,
