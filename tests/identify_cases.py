@@ -49,7 +49,7 @@ class Plant:
         begin = round(self.lead * self.fps)
         tracks, grips = self.simulate(grips)[:, begin:], grips[:, begin:]
         tracks = tracks + np.random.default_rng(seed).normal(0.0, 1.0, tracks.shape) * noise
-        return [self._episode(e, tracks[e], grips[e]) for e in range(len(grips))]
+        return [self.episode(e, tracks[e], grips[e]) for e in range(len(grips))]
 
     def simulate(self, grips: Array) -> Array:
         """(E, T, N, 3) [m] for gripper positions (E, T, G, 3), whose first frame sits at the held particles."""
@@ -111,7 +111,8 @@ class Plant:
         force[:, 2:] += gb
         return force
 
-    def _episode(self, number: int, track: Array, grips: Array) -> Episode:
+    def episode(self, number: int, track: Array, grips: Array) -> Episode:
+        """Tracks (T, N, 3) and gripper positions (T, G, 3) as an episode."""
         frames, count = track.shape[:2]
         stamps = 10**9 + np.arange(frames, dtype=np.int64) * round(1e9 / self.fps)
         held = np.full(count, -1, np.int32)

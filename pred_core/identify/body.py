@@ -29,9 +29,10 @@ class Layout:
     mass_known: bool
 
 
-def lay_out(dataset: Dataset, episodes: Sequence[Episode], config: IdentifyConfig) -> Layout:
+def lay_out(dataset: Dataset, episodes: Sequence[Episode], config: IdentifyConfig, noise: float = 0.0) -> Layout:
     """Particles at rest: a line is laid out straight with its median edge lengths, others as first seen.
 
+    `noise` [m] of the tracks: edges are freed of what it adds to them.
     Raises: DatasetError if episodes differ in particles, or particles that the rest shape needs are not seen.
     """
     ids = episodes[0].tracks.id
@@ -44,7 +45,7 @@ def lay_out(dataset: Dataset, episodes: Sequence[Episode], config: IdentifyConfi
                 next_step="Split the data set by object",
             )
     kind = dataset.object.kind
-    edges = _edges(episodes) if kind == "line" else None
+    edges = _edges(episodes, noise) if kind == "line" else None
     rest = _first_shape(episodes) if edges is None else _straight(edges)
     spacing = _neighbour_distances(rest)
     shortest = 1.001 * float(edges.max() if edges is not None else spacing.max())
@@ -55,8 +56,11 @@ def lay_out(dataset: Dataset, episodes: Sequence[Episode], config: IdentifyConfi
     return Layout(body, scene, shortest, max(WIDEST * float(np.median(spacing)), 1.01 * shortest), mass is not None)
 
 
-def _edges(episodes: Sequence[Episode]) -> Array:
-    """(N-1,) [m] median distance of consecutive particles over all frames."""
+def _edges(episodes: Sequence[Episode], noise: float) -> Array:
+    """(N-1,) [m] median distance of consecutive particles over all frames.
+
+    Noise across an edge makes it longer: both ends have `noise` in two directions, l^2 + 4 noise^2.
+    """
     lengths = np.concatenate([np.linalg.norm(np.diff(e.position, axis=1), axis=2) for e in episodes])
     ids = episodes[0].tracks.id
     never = np.flatnonzero(~np.isfinite(lengths).any(axis=0))
@@ -66,7 +70,8 @@ def _edges(episodes: Sequence[Episode]) -> Array:
             got=", ".join(f"{ids[i]} and {ids[i + 1]}" for i in never[:3].tolist()),
             next_step="Leave out particles that are not tracked",
         )
-    return np.asarray(np.nanmedian(lengths, axis=0), dtype=np.float64)
+    median = np.asarray(np.nanmedian(lengths, axis=0), dtype=np.float64)
+    return np.sqrt(np.maximum(median**2 - 4.0 * noise**2, (0.5 * median) ** 2))
 
 
 def _straight(edges: Array) -> Array:

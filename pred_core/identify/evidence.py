@@ -42,7 +42,7 @@ def gather_evidence(
     best: Candidate,
     restarts: Sequence[Restart],
     stride: int,
-    most_substeps: int,
+    most_substeps: float,
 ) -> Values:
     """Per knob of `space`, at `best`. `searched`: the knobs of the restarts; `stride`: frames between residuals."""
     here = space.at(best)
@@ -50,11 +50,14 @@ def gather_evidence(
     smooth = SearchSpace(tuple(k for k in here.knobs if k.name not in DISCRETE), here.physics, here.extensions)
     widths = dict(zip((k.name for k in smooth.knobs), half_widths(problem, smooth, stride), strict=True))
     ends = [searched.values(r.z) for r in restarts if r.loss <= CLOSE * restarts[0].loss]
+    demand = problem.demand(here.candidate(here.start()))
     result: Values = {}
     for n, (knob, sensitivity) in enumerate(zip(here.knobs, growth, strict=True)):
-        more = here.start()
-        more[n] = knob_step(knob)
-        stiffer = problem.needed(here.candidate(more)) > most_substeps
+        stiffer = False
+        if knob.name not in DISCRETE:
+            more = here.start()
+            more[n] = knob_step(knob)
+            stiffer = problem.demand(here.candidate(more)) > max(most_substeps, 1.01 * demand)
         shown = sensitivity >= FLOOR
         width = widths.get(knob.name) if shown else None
         spread = [end[knob.name] for end in ends if knob.name in end]

@@ -39,13 +39,14 @@ def prepare(dataset: Dataset, episodes: Sequence[Episode], config: IdentifyConfi
     if not config.stages:
         raise ConfigError("stages", got="none", allowed="at least one window length [s]")
     layout = lay_out(dataset, episodes, config)
-    space, notes = _space(layout, config)
-    if not layout.mass_known:
-        notes.append(f"mass is nominal ({config.mass:g} kg): motion alone does not show it")
     period = float(np.median([e.period for e in episodes]))
     recordings = [align(e, layout.body, period) for e in episodes]
     _check_lengths(recordings, period, config)
     noise = dataset.sigma if dataset.sigma is not None else track_noise(recordings)
+    layout = lay_out(dataset, episodes, config, noise)
+    space, notes = _space(layout, config)
+    if not layout.mass_known:
+        notes.append(f"mass is nominal ({config.mass:g} kg): motion alone does not show it")
     stages = Stages(layout, _topology(layout, config), period, noise if config.estimate_starts else None, config, tell)
     return Prepared(stages, space, recordings, noise, tuple(notes))
 

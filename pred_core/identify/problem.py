@@ -55,8 +55,8 @@ class Problem:
         seen = windows.seen.float()
         self._share = (seen / (3.0 * seen.sum(dim=(0, 2), keepdim=True)).clamp_min(1.0))[..., None]
 
-    def needed(self, candidate: Candidate) -> int:
-        """The fewest substeps a period that keep this candidate stable (`springmass.stability`), without a limit."""
+    def demand(self, candidate: Candidate) -> float:
+        """Substeps a period that keep this candidate stable (`springmass.stability`), neither rounded nor limited."""
         body = self.body if self.topology is None else self.topology.body(candidate.physics)
         effects = tuple(find_effect(e.id) for e in candidate.extensions)
         bounds = [e.bend_bound(x.parameters) for e, x in zip(effects, candidate.extensions, strict=True)]
@@ -65,11 +65,11 @@ class Problem:
         if any("inertia" in e.hooks for e in effects):
             mass = mass_of_worlds(body, [candidate.extensions], effects)[0].double().numpy()
         w, d = spectrum_bound(body, candidate.physics, bend, self.held, mass)
-        return max(1, math.ceil(self.period * (d + math.sqrt(d * d + 4.0 * w * w)) / (4.0 * SAFETY)))
+        return self.period * (d + math.sqrt(d * d + 4.0 * w * w)) / (4.0 * SAFETY)
 
     def substeps(self, candidate: Candidate) -> int:
         """What this candidate is simulated with, a rung; what it needs if that is beyond `most_substeps`."""
-        needed = self.needed(candidate)
+        needed = max(1, math.ceil(self.demand(candidate)))
         if needed > self.room * self.most_substeps:
             return needed
         return min(next(r for r in RUNGS if r >= needed), self.most_substeps)

@@ -34,7 +34,7 @@ class Refined:
 
     z: Array
     loss: float  # [m] mean absolute error of the windows kept
-    left_out: tuple[str, ...]  # episodes with windows that were outliers
+    left_out: tuple[str, ...]  # episodes at least half of whose windows were outliers
 
 
 def refine(problem: Problem, space: SearchSpace, z: Array, iterations: int, stride: int, report: Report) -> Refined:
@@ -72,8 +72,15 @@ def refine(problem: Problem, space: SearchSpace, z: Array, iterations: int, stri
         if before - better < IMPROVEMENT * before:
             break
     report(iterations, iterations, loss)
-    names = [n for n, k in zip(problem.windows.names, keep, strict=True) if not k]
-    return Refined(z, loss, tuple(dict.fromkeys(names)))
+    return Refined(z, loss, _damaged(problem.windows.names, keep))
+
+
+def _damaged(names: tuple[str, ...], keep: NDArray[np.bool_]) -> tuple[str, ...]:
+    """Episodes with at least half of their windows left out."""
+    left: dict[str, list[bool]] = {}
+    for name, k in zip(names, keep.tolist(), strict=True):
+        left.setdefault(name, []).append(not k)
+    return tuple(n for n, v in left.items() if 2 * sum(v) >= len(v))
 
 
 def kept(residual: Residuals) -> tuple[NDArray[np.bool_], float]:

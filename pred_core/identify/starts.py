@@ -20,6 +20,7 @@ from pred_core.types import Array
 
 WIDEST = 6  # frames on each side
 FINEST = 1e-6  # [m] what float32 tracks resolve; three frames always fit, which is the central difference
+SURE = 0.99  # share of straight noise that passes the test
 CALM = 0.1  # share of the frames the noise is read from
 
 
@@ -44,9 +45,9 @@ def track_noise(recordings: list[Recording]) -> float:
 def estimate_start(recording: Recording, frame: int, period: float, noise: float) -> tuple[Tensor, Tensor]:
     """(position (N, 3) [m], velocity (N, 3) [m/s]) at `frame`.
 
-    Each free particle takes the widest window whose quadratic fits within twice the noise (Lepski's rule). Without
-    clean frames around: backward difference, which lags half a period behind. Held particles sit where they are in
-    their gripper on average.
+    Each free particle takes the widest window whose quadratic leaves no more than the noise (a chi-square test, in
+    the manner of Lepski). Without clean frames around: backward difference, which lags half a period
+    behind. Held particles sit where they are in their gripper on average.
     """
     measured = recording.position[frame].double().numpy()
     position, velocity = measured.copy(), (measured - recording.position[frame - 1].double().numpy()) / period
@@ -60,7 +61,8 @@ def estimate_start(recording: Recording, frame: int, period: float, noise: float
         if not np.isfinite(span).all():
             break
         fit, error = _quadratic(span)
-        good = ~settled & (error <= 2.0 * max(noise, FINEST))
+        freedom = max(3 * (2 * m - 2), 1)
+        good = ~settled & (error <= np.sqrt(chi2.ppf(SURE, freedom) / freedom) * max(noise, FINEST))
         position[good], velocity[good] = fit[0][good], fit[1][good] / period
         settled |= ~good
     if held.any():
