@@ -136,7 +136,13 @@ class Plant:
         )
 
 
-def write(root: Path, plant: Plant, episodes: list[Episode], sigma: float | None = 0.0) -> Dataset:
+def write(
+    root: Path,
+    plant: Plant,
+    episodes: list[Episode],
+    sigma: float | None = 0.0,
+    gravity: tuple[float, float, float] = STANDARD_GRAVITY,
+) -> Dataset:
     """The episodes as a data set of bags."""
     entries = []
     for e in episodes:
@@ -148,6 +154,7 @@ def write(root: Path, plant: Plant, episodes: list[Episode], sigma: float | None
         rate=plant.fps,
         entries=entries,
         sigma=sigma,
+        gravity=gravity,
         held={p: g for g, p in enumerate(plant.held)},
         known={"mass": plant.mass},
     )
