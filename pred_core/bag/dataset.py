@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -28,6 +29,9 @@ class EpisodeEntry:
     bag: str = setting(doc="file in the data set's folder")
     split: str = setting(choices=SPLITS, doc="what the episode is for")
     recording: int = setting(-1, low=-1, doc="groups episodes that must not be split; -1: a recording of its own")
+    held: dict | None = dataclasses.field(  # type: ignore[type-arg]
+        default=None, hash=False, metadata={"doc": "particle id -> gripper index, where it differs from the data set's"}
+    )
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ class Dataset:
             self.root / entry.bag,
             name=Path(entry.bag).stem,
             object=self.object,
-            held=self.held,
+            held=self.held if entry.held is None else entry.held,
             gravity=self.gravity,
             split=entry.split,
             recording=entry.recording,
@@ -158,6 +162,8 @@ def load_dataset(path: Path | str) -> Dataset:
             raise DatasetError(f"{source}: bag '{bag}'", allowed="a path inside the data set's folder")
         if bags.count(bag) > 1:
             raise DatasetError(f"{source}: bag '{bag}' is listed twice", allowed="each bag once")
+    for entry in config.episodes:
+        _checked_held(entry.held, f"{source}: {entry.bag}")
     missing = [bag for bag in bags if not (root / bag).exists()]
     if missing:
         raise DatasetError(
@@ -196,7 +202,7 @@ def write_dataset(
         plain["held"] = {int(k): int(v) for k, v in held.items()}
     if known:
         plain["known"] = dict(known)
-    plain["episodes"] = [to_mapping(e) for e in entries]
+    plain["episodes"] = [{k: v for k, v in to_mapping(e).items() if k != "held" or v is not None} for e in entries]
     path = Path(root) / FILE
     partial = path.with_name(f".{FILE}.part")
     try:
@@ -244,6 +250,6 @@ def _with_recordings(entries: Sequence[EpisodeEntry]) -> tuple[EpisodeEntry, ...
     result = []
     for entry in entries:
         if entry.recording < 0:
-            entry, free = EpisodeEntry(entry.bag, entry.split, free), free + 1
+            entry, free = dataclasses.replace(entry, recording=free), free + 1
         result.append(entry)
     return tuple(result)

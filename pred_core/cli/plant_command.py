@@ -1,0 +1,95 @@
+"""`pred plant`: data sets of an independent world, with something hidden in it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from pred_core.bag.dataset import Dataset
+from pred_core.cli.convert_command import progress_line
+from pred_core.config import check_ranges
+from pred_core.errors import ConfigError
+from pred_core.plant.case import truth_path
+from pred_core.plant.hidden.library import LIBRARY, NONE, find_entry
+from pred_core.plant.rope_case import Hidden, write_rope_case
+from pred_core.plant.sensing import SensorConfig
+from pred_core.plant.session import SessionConfig
+from pred_core.plant.springs import write_springs_case
+
+NAME = "plant"
+HELP = "Make data sets of an independent world (MuJoCo), with a hidden effect in it."
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `pred plant`."""
+    worlds = parser.add_subparsers(dest="world", required=True, metavar="WORLD")
+    rope = worlds.add_parser("rope", help="a MuJoCo rope in the air and on a table")
+    rope.add_argument("--effect", action="append", metavar="NAME", help="what is hidden; may be given twice; or none")
+    rope.add_argument("--magnitude", action="append", type=float, metavar="M", help="one an effect, in its unit")
+    springs = worlds.add_parser("springs", help="springs like those of our simulator, finer: nothing is hidden")
+    for world in (rope, springs):
+        world.add_argument("--seed", type=int, default=0, help="motions, noise, directions and places")
+        world.add_argument("--out", type=Path, required=True, metavar="DATASET", help="folder to write")
+        world.add_argument("--episodes", type=int, nargs=3, default=(12, 6, 6), metavar=("TRAIN", "TEST", "OOD"))
+        world.add_argument("--seconds", type=float, default=SessionConfig.seconds, help="of an episode")
+        world.add_argument("--particles", type=int, default=SessionConfig.particles, help="tracked points")
+        world.add_argument("--rate", type=float, default=SensorConfig.rate, help="of the tracks [Hz]")
+        world.add_argument("--noise", type=float, default=SensorConfig.noise, help="of the tracks [m]")
+    rope.set_defaults(make=_rope)
+    springs.set_defaults(make=_springs)
+    worlds.add_parser("effects", help="list the effects that can be hidden").set_defaults(make=_effects)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make one data set; interrupted and started again, it goes on where it stopped. Or list the effects."""
+    return int(args.make(args))
+
+
+def _rope(args: argparse.Namespace) -> int:
+    session, sensor = _settings(args)
+    hidden = hidden_effects(args.effect or [], args.magnitude or [])
+    return _report(write_rope_case(args.out, hidden, args.seed, progress_line(), session=session, sensor=sensor))
+
+
+def _springs(args: argparse.Namespace) -> int:
+    session, sensor = _settings(args)
+    return _report(write_springs_case(args.out, args.seed, progress_line(), session=session, sensor=sensor))
+
+
+def _effects(args: argparse.Namespace) -> int:
+    print(f"{'effect':<22}{'family':<16}{'unit':<13}{'minimum':>9}{'range':>16}  law")
+    for e in LIBRARY.values():
+        mark = " (not meant to have a name)" if e.unlisted else ""
+        print(f"{e.name:<22}{e.family:<16}{e.unit:<13}{e.minimum:>9g}{f'{e.low:g} to {e.high:g}':>16}  {e.law}{mark}")
+    return 0
+
+
+def hidden_effects(names: list[str], magnitudes: list[float]) -> Hidden:
+    """Pairs of effect and magnitude; an effect without one gets its minimum. Raises: ConfigError."""
+    if names in ([], [NONE]):
+        if any(magnitudes):
+            raise ConfigError("--magnitude without an effect", got=magnitudes, next_step="Name one with --effect")
+        return ()
+    entries = [find_entry(name) for name in names]
+    if magnitudes and len(magnitudes) != len(entries):
+        raise ConfigError("--magnitude", got=f"{len(magnitudes)} values", allowed=f"one an effect, {len(entries)}")
+    return tuple((e.name, m) for e, m in zip(entries, magnitudes or [e.minimum for e in entries], strict=True))
+
+
+def _settings(args: argparse.Namespace) -> tuple[SessionConfig, SensorConfig]:
+    train, test, ood = args.episodes
+    session = SessionConfig(train, test, ood, args.seconds, args.particles)
+    sensor = SensorConfig(rate=args.rate, noise=args.noise)
+    check_ranges(session, "pred plant")
+    check_ranges(sensor, "pred plant")
+    if train + test + ood < 1:
+        raise ConfigError("--episodes", got=f"{train} {test} {ood}", allowed="at least one")
+    if args.seed < 0:
+        raise ConfigError("--seed", got=args.seed, allowed="0 or more")
+    return session, sensor
+
+
+def _report(dataset: Dataset) -> int:
+    counts = ", ".join(f"{len(dataset.select(s))} {s}" for s in dataset.splits)
+    print(f"{dataset.root}: {len(dataset.entries)} episodes ({counts}); the truth stands in {truth_path(dataset.root)}")
+    return 0

@@ -1,0 +1,1 @@
+"""Hidden effects, written against MuJoCo's own API."""
