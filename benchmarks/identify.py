@@ -1,6 +1,6 @@
 """Wall time of an identification, and whether it reaches the error floor of the planted values.
 
-    python benchmarks/identify.py [--quick]
+    python benchmarks/identify.py [--quick] [--only TEXT]
 
 Three objects with known values, simulated with three times the substeps: a 13-particle cable and a 30-particle rope
 (16 episodes of 5 s), and a sheet of 500 particles (4 episodes of 2 s, a shorter search). All have air drag. The floor
@@ -36,7 +36,7 @@ from pred_core.springmass import SpringMass, build_body
 from pred_core.types import Array, Body, Episode, Grip, ObjectInfo, Physics, State, Tracks
 
 MASS = 0.05  # [kg]
-SETTLE = 1.0  # [s] at the planted values before the recording
+SETTLE = 1.0  # [s] a line hangs before the recording; a sheet's first frame is its rest shape, so it begins flat
 
 
 @dataclass(frozen=True)
@@ -90,14 +90,15 @@ def cases(quick: bool) -> list[Case]:
 def record(case: Case, body: Body) -> list[Episode]:
     """Episodes of the planted object; all are simulated as one batch."""
     rng = np.random.default_rng(1)
-    lead, frames = round(SETTLE * case.rate), round((SETTLE + case.seconds) * case.rate)
-    when = np.arange(frames) / case.rate - SETTLE
+    settle = SETTLE if case.kind == "line" else 0.0
+    lead, frames = round(settle * case.rate), round((settle + case.seconds) * case.rate)
+    when = np.arange(frames) / case.rate - settle
     shape = (case.episodes, 1, len(case.held), 3, 2)
     angle = 2 * np.pi * rng.uniform(0.3, 1.2, shape) * when[:, None, None, None] + rng.uniform(0, 6.3, shape)
     size = rng.uniform(0.01, 0.03, shape) if case.kind == "line" else rng.uniform(0.003, 0.008, shape)
     home = case.rest[list(case.held)]
     motion = home + np.clip(when, 0.0, 1.0)[:, None, None] * (size * np.sin(angle)).sum(-1)
-    inward = 0.5 * case.slack * np.clip((when + SETTLE) / 0.5, 0.0, 1.0)
+    inward = 0.5 * case.slack * np.clip((when + settle) / 0.5, 0.0, 1.0)
     motion[:, :, 0, 0] += inward
     motion[:, :, -1, 0] -= inward
     pose = torch.as_tensor(motion, dtype=torch.float32)
@@ -111,7 +112,8 @@ def record(case: Case, body: Body) -> list[Episode]:
     simulator = SpringMass(body, case.physics, period=1.0 / case.rate, substeps=3 * chosen, extensions=[DRAG])
     state = State(position, torch.zeros_like(position), held.expand(case.episodes, -1).contiguous())
     by_time = Grip(pose.movedim(1, 0), turn.movedim(1, 0), grips.closed.movedim(1, 0))
-    tracks = simulator.rollout(simulator.start(state, by_time.at(0)), by_time.span(1, frames))[lead:]
+    tracks = simulator.rollout(simulator.start(state, by_time.at(0)), by_time.span(1, frames))
+    tracks = torch.cat((position[None], tracks))[lead:]
     stamps = 10**9 + np.arange(len(tracks), dtype=np.int64) * round(1e9 / case.rate)
     seen = np.ones((len(tracks), body.count), bool)
     return [
@@ -120,7 +122,7 @@ def record(case: Case, body: Body) -> list[Episode]:
             object=ObjectInfo(case.name, case.kind),
             stamps=stamps,
             tracks=Tracks(stamps, tracks[:, e].double().numpy(), body.id, seen, seen.astype(np.float32)),
-            grips=Grip(pose[e, lead + 1 :], turn[e, lead + 1 :], grips.closed[e, lead + 1 :]),
+            grips=Grip(pose[e, lead:], turn[e, lead:], grips.closed[e, lead:]),
             held=held.numpy(),
             split="train",
             recording=e,
@@ -180,9 +182,10 @@ def main() -> int:
     """Print a line a case."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--quick", action="store_true", help="the cable and the rope, 4 episodes of 3 s each")
+    parser.add_argument("--only", default="", help="cases whose name has this text")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    for case in cases(args.quick):
+    for case in (c for c in cases(args.quick) if args.only in c.name):
         with tempfile.TemporaryDirectory() as folder:
             print(measure(case, Path(folder)), flush=True)
     return 0

@@ -28,7 +28,7 @@ class Evidence:
     identifiable: bool  # the loss changes by a thousandth at least
     at_bound: bool  # on a bound, or as stiff as the substeps allowed
     spread: tuple[float, float] | None = None  # over the restarts that ended within 5 % of the best
-    interval: tuple[float, float] | None = None  # local, 95 %, recordings taken as independent
+    interval: tuple[float, float] | None = None  # local, 95 %, see `interval`
 
     def plain(self) -> dict[str, Any]:
         """As stored in JSON and YAML."""
@@ -41,14 +41,13 @@ def gather_evidence(
     searched: SearchSpace,
     best: Candidate,
     restarts: Sequence[Restart],
-    stride: int,
     most_substeps: float,
 ) -> Values:
-    """Per knob of `space`, at `best`. `searched`: the knobs of the restarts; `stride`: frames between residuals."""
+    """Per knob of `space`, at `best`. `searched`: the knobs of the restarts; `most_substeps`: what it could use."""
     here = space.at(best)
     growth = sensitivities(problem, here)
     smooth = SearchSpace(tuple(k for k in here.knobs if k.name not in DISCRETE), here.physics, here.extensions)
-    widths = dict(zip((k.name for k in smooth.knobs), half_widths(problem, smooth, stride), strict=True))
+    widths = dict(zip((k.name for k in smooth.knobs), half_widths(problem, smooth), strict=True))
     ends = [searched.values(r.z) for r in restarts if r.loss <= CLOSE * restarts[0].loss]
     demand = problem.demand(here.candidate(here.start()))
     result: Values = {}

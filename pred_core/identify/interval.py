@@ -1,7 +1,9 @@
-"""Local 95 % intervals: a sandwich estimator whose clusters are recordings.
+"""Local 95 % intervals of single parameters, from how the loss itself bends about the optimum.
 
-H^-1 (sum over clusters of g g') H^-1, with central differences. Rollouts can be chaotic: a window whose slopes up
-and down differ by more than their sum is no longer smooth over the step and counts as saying nothing.
+A sandwich estimator of one parameter at a time, the others fixed, whose clusters are recordings: the slopes g_c of the
+recordings' losses scatter, the curvature H of their sum holds the optimum in place,
+var = C/(C-1) sum (g_c - mean g)^2 / H^2. Differences are taken over a change of 10 %, not over an infinitesimal one:
+rollouts can be chaotic, and small steps would show slopes that hold nowhere.
 """
 
 from __future__ import annotations
@@ -10,52 +12,36 @@ import numpy as np
 from scipy.stats import t as student
 
 from pred_core.identify.problem import Problem
-from pred_core.identify.refine import SOFTNESS, kept
+from pred_core.identify.refine import OUTLIER
+from pred_core.identify.sensitivity import knob_step
 from pred_core.identify.space import SearchSpace
 
 LEVEL = 0.95
-STEP = 0.01  # finite difference, in coordinates: 2 % of a stiffness
 
 
-def half_widths(problem: Problem, space: SearchSpace, stride: int) -> list[float | None]:
+def half_widths(problem: Problem, space: SearchSpace) -> list[float | None]:
     """Half width of each knob's interval in coordinates, about the zero of `space`.
 
-    None where there is no telling: a single recording, a value at its bound, or no window that is smooth in it.
-    Student's t with (recordings - 1) degrees of freedom, because recordings are few.
+    None where there is no telling: a single recording, a value within 10 % of its bound, or a loss that does not rise
+    to both sides. Student's t with (recordings - 1) degrees of freedom, because recordings are few.
     """
-    groups = sorted(set(problem.windows.groups))
     lower, upper = (np.array(b) for b in space.bounds())
-    up, down = np.minimum(STEP, upper), np.minimum(STEP, -lower)
-    inside = np.minimum(up, down) > 0.1 * STEP
-    wanted = np.flatnonzero(inside)
-    nothing: list[float | None] = [None] * len(space.knobs)
-    if len(groups) < 2 or not len(wanted):
-        return nothing
-    axes = np.eye(len(space.knobs))
-    points = [space.start(), *(up[d] * axes[d] for d in wanted), *(-down[d] * axes[d] for d in wanted)]
-    candidates = [space.candidate(p) for p in points]
+    steps = np.array([knob_step(k) for k in space.knobs])
+    axes = np.diag(steps)
+    candidates = [space.candidate(z) for z in (space.start(), *axes, *-axes)]
     substeps = min(max(problem.substeps(c) for c in candidates), problem.most_substeps)
-    rolled = problem.residuals(candidates, stride, substeps)
-    keep, _ = kept(rolled[0])
-    now, rolled = rolled[0][keep], rolled[1:][:, keep]
-    rises = (rolled[: len(wanted)] - now) / up[wanted].astype(np.float32)[:, None, None]
-    falls = (now - rolled[len(wanted) :]) / down[wanted].astype(np.float32)[:, None, None]
-    smooth = np.abs(rises - falls).sum(axis=2) <= np.abs(rises + falls).sum(axis=2)
-    jacobian = np.where(smooth[..., None], 0.5 * (rises + falls), np.float32(0.0))
-    weight = 1.0 / np.sqrt(now**2 + np.float32(SOFTNESS**2))
-    scores = np.einsum("dwr,wr->wd", jacobian, weight * now).astype(np.float64)
-    hessian = np.einsum("dwr,ewr->de", jacobian * weight[None], jacobian).astype(np.float64)
+    losses = problem.losses(candidates, substeps)
+    keep = losses[0] <= OUTLIER * np.median(losses[0])
     member = np.array(problem.windows.groups)[keep]
-    sums = np.stack([scores[member == g].sum(axis=0) for g in sorted(set(member.tolist()))])
-    if len(sums) < 2:
-        return nothing
-    sums -= sums.mean(axis=0)
-    meat = sums.T @ sums * len(sums) / (len(sums) - 1)
-    inverse = np.linalg.pinv(hessian, rcond=1e-10)
-    variance = np.diag(inverse @ meat @ inverse)
-    factor = float(student.ppf(0.5 + LEVEL / 2, len(sums) - 1))
-    widths = nothing.copy()
-    for n, d in enumerate(wanted.tolist()):
-        if hessian[n, n] > 0.0:
-            widths[d] = factor * float(np.sqrt(max(variance[n], 0.0)))
-    return widths
+    clusters = sorted(set(member.tolist()))
+    if len(clusters) < 2:
+        return [None] * len(space.knobs)
+    sums = np.stack([losses[:, keep][:, member == c].sum(axis=1) for c in clusters], axis=1)  # (1 + 2D, C)
+    here, up, down = sums[0], sums[1 : 1 + len(steps)], sums[1 + len(steps) :]
+    slope = (up - down) / (2.0 * steps[:, None])
+    curvature = (up + down - 2.0 * here).sum(axis=1) / steps**2
+    scatter = ((slope - slope.mean(axis=1, keepdims=True)) ** 2).sum(axis=1) * len(clusters) / (len(clusters) - 1)
+    factor = float(student.ppf(0.5 + LEVEL / 2, len(clusters) - 1))
+    known = (curvature > 0.0) & (steps <= upper) & (-steps >= lower)
+    return [factor * float(np.sqrt(s)) / float(c) if k else None
+            for s, c, k in zip(scatter, curvature, known, strict=True)]  # fmt: skip

@@ -33,8 +33,10 @@ def write_report(path: Path, result: Identified, command: str) -> None:
     page.table(header, [_row(n, e) for n, e in result.values.items()], marks)
     page.text(
         "Where a change of 10 % changes the loss by less than 0.1 %, these data do not show the parameter: any value "
-        "near it predicts as well, and no interval is given. Intervals are local: they come from the slopes at the "
-        "optimum with recordings as independent clusters, and say nothing of other optima or of what the model lacks.",
+        "near it predicts as well, and no interval is given; nor is one where the loss does not rise to both sides, as "
+        "with few or chaotic recordings. Intervals are local: they come from how the loss of each "
+        "recording changes over 10 % with the other parameters fixed, and say nothing of other optima, of parameters "
+        "that trade against each other, or of what the model lacks.",
         note=True,
     )
     for note in result.twin.meta.notes:

@@ -89,9 +89,8 @@ def identify(
     problem = stages.whole(recordings)
     substeps = min(problem.substeps(best), config.substeps)
     losses = problem.losses([best], substeps)[0]
-    stride = min(config.stride, len(problem.windows.target))
     wall = config.substeps * (1.0 if refined is None else ROOM)
-    values = gather_evidence(problem, space, searched, best, restarts, stride, wall)
+    values = gather_evidence(problem, space, searched, best, restarts, wall)
     meta = TwinMeta(
         object=dataset.object,
         period=stages.period,

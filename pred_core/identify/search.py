@@ -66,7 +66,7 @@ def search(
         }
         strategy = cma.CMAEvolutionStrategy([*start, *[0.0] * pad], 1.0, options)
         best_z, best, done = start, np.inf, 0
-        while not strategy.stop():
+        while done < evaluations and not strategy.stop():
             points = np.array(strategy.ask())
             losses = journal.evaluate(points, lambda p: _losses(problem, space, p))
             strategy.tell(list(points), losses.tolist())
