@@ -148,9 +148,9 @@ def test_bad_data_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     good = PLANT.episodes(waves(PLANT, 2, 1.2))
     out = str(tmp_path / "out")
     other = changed(good[1], id=np.arange(1, 9, dtype=np.uint32))
-    root = write(tmp_path / "ids", PLANT, [good[0], dataclasses.replace(other)]).root
-    line_said = refusal([str(root), "--out", out], capsys)
-    assert "ep001" in line_said and ("ids differ" in line_said or "id" in line_said)
+    other = dataclasses.replace(other, held=np.roll(good[1].held, -1))
+    root = write(tmp_path / "ids", dataclasses.replace(PLANT, held=(1, 7)), [good[0], other]).root
+    assert "ep001: particle ids differ from ep000" in refusal([str(root), "--out", out], capsys)
 
     tests_only = [dataclasses.replace(e, split="test") for e in good]
     root = write(tmp_path / "split", PLANT, tests_only).root
@@ -162,7 +162,7 @@ def test_bad_data_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     root = tmp_path / "lost"
     hidden = [changed(e, position=p, visible=np.isfinite(p).all(-1)) for e, p in zip(good, lost, strict=True)]
     write(root, PLANT, hidden)
-    assert refusal([str(root), "--out", out], capsys)
+    assert "never seen together; got 2 and 3, 3 and 4" in refusal([str(root), "--out", out], capsys)
     assert not Path(out).exists()
 
 
