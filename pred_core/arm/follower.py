@@ -1,0 +1,166 @@
+"""Follows timed gripper poses: a plan is taken whole or refused with one line, then sampled at any time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pred_core.arm.limits import GuardConfig
+from pred_core.arm.orientation import Quaternion, angle_between, slerp
+from pred_core.errors import InputError
+
+Array = NDArray[np.float64]
+NS = 1e9
+WORLD = "world"
+UNIT_TOLERANCE = 1e-3  # of a quaternion's norm, as in the bag contract
+OVER = 1.5  # a plan may ask for this times the speed limit between two points; the guard lags behind it
+REST = 1e-6  # [m], [rad] between the last two points of a plan that ends at rest
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Poses of one gripper over time, in `world`."""
+
+    start: int  # [ns]
+    times: Array  # (K,) [s] after start, increasing
+    position: Array  # (K, 3) [m]
+    rotation: Array  # (K, 4) wxyz, unit
+
+    @property
+    def begin(self) -> int:
+        """Of the first point [ns]."""
+        return self.start + round(float(self.times[0]) * NS)
+
+    @property
+    def end(self) -> int:
+        """Of the last point [ns]."""
+        return self.start + round(float(self.times[-1]) * NS)
+
+    @property
+    def ends_at_rest(self) -> bool:
+        """The last two points are the same pose: the arm may wait there."""
+        still = float(np.linalg.norm(self.position[-1] - self.position[-2])) <= REST
+        return still and angle_between(_wxyz(self.rotation[-2]), _wxyz(self.rotation[-1])) <= REST
+
+    def at(self, time: int) -> tuple[Array, Quaternion]:
+        """The pose at `time` [ns]: linear in position, slerp in rotation; the first and last one beyond the ends."""
+        seconds = (time - self.start) / NS
+        k = int(np.clip(np.searchsorted(self.times, seconds, side="right") - 1, 0, len(self.times) - 2))
+        share = float(np.clip((seconds - self.times[k]) / (self.times[k + 1] - self.times[k]), 0.0, 1.0))
+        position = self.position[k] + share * (self.position[k + 1] - self.position[k])
+        return position, slerp(_wxyz(self.rotation[k]), _wxyz(self.rotation[k + 1]), share)
+
+
+def make_plan(
+    start: int, frame: str, times: Sequence[float], position: Array, rotation: Array, config: GuardConfig
+) -> Plan:
+    """A plan that can be followed.
+
+    Args: start [ns]; frame of the poses; times (K,) [s]; position (K, 3) [m]; rotation (K, 4) wxyz.
+    Raises: InputError for another frame than world, fewer than two points, times that do not increase, values that
+    are not finite, quaternions without unit norm, or a jump between two points.
+    """
+    if frame != WORLD:
+        raise InputError("plan is in another frame", got=repr(frame), allowed=repr(WORLD))
+    moments = np.asarray(times, float)
+    if len(moments) < 2:
+        raise InputError("plan has too few points", got=len(moments), allowed="2 or more")
+    if position.shape != (len(moments), 3) or rotation.shape != (len(moments), 4):
+        raise InputError("plan", got=f"shapes {position.shape} and {rotation.shape}", allowed="one pose per point")
+    if not (np.isfinite(moments).all() and np.isfinite(position).all() and np.isfinite(rotation).all()):
+        raise InputError("plan has a value that is not finite")
+    if moments[0] < 0.0 or not (np.diff(moments) > 0.0).all():
+        raise InputError("plan's times do not increase from 0", got=np.round(moments[:6], 4).tolist())
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(rotation, axis=-1)
+    if not (np.abs(norm - 1.0) <= UNIT_TOLERANCE).all():
+        raise InputError("plan has a quaternion without unit norm", got=norm[:6].tolist(), allowed="1 +- 0.001")
+    plan = Plan(start, moments, np.asarray(position, float), rotation / norm[:, None])
+    _check_jumps(plan, config)
+    return plan
+
+
+class Follower:
+    """Holds the plan in force and the next one, whose first point is not due yet."""
+
+    def __init__(self, config: GuardConfig, lifetime: float):
+        self._config = config
+        self._lifetime = lifetime  # [s] after its stamp a plan is followed no more
+        self._plan: Plan | None = None
+        self._next: Plan | None = None
+
+    @property
+    def plan(self) -> Plan | None:
+        """The plan in force."""
+        return self._plan
+
+    def clear(self) -> None:
+        """Forget every plan."""
+        self._plan = self._next = None
+
+    def accept(self, plan: Plan, here: tuple[Array, Quaternion], now: int) -> None:
+        """Follow a plan from its first point on. `here`: the present set-point, `now` [ns].
+
+        Raises: InputError for a plan that is over, too old, or begins where the arm cannot be by then.
+        """
+        if plan.end <= now:
+            raise InputError("plan lies in the past", got=f"it ended {(now - plan.end) / NS:.3f} s ago")
+        if now - plan.start > self._lifetime * NS:
+            raise InputError("plan is too old", got=f"{(now - plan.start) / NS:.3f} s", allowed=f"{self._lifetime:g} s")
+        due = max(now, plan.begin)
+        old = self._plan.at(due) if self._plan is not None and self._plan.end > now else here
+        position, rotation = plan.at(due)
+        ahead = 0.0 if self._plan is not None and self._plan.end > now else (due - now) / NS
+        most = self._config.step + self._config.speed * ahead
+        most_angle = self._config.angular_step + self._config.angular_speed * ahead
+        off, angle = float(np.linalg.norm(position - old[0])), angle_between(old[1], rotation)
+        if off > most or angle > most_angle:
+            raise InputError(
+                "plan does not begin where the arm will be",
+                got=f"{1e3 * off:.0f} mm, {angle:.2f} rad away",
+                allowed=f"{1e3 * most:.0f} mm, {most_angle:.2f} rad",
+                next_step="Plan from the measured gripper pose",
+            )
+        if plan.begin <= now or self._plan is None:
+            self._plan, self._next = plan, None
+        else:
+            self._next = plan
+
+    def target(self, now: int, lead: float) -> tuple[Array, Quaternion] | None:
+        """The pose to ask for at `now` [ns], `lead` [s] ahead in the plan; None: nothing to ask for.
+
+        None before the first plan begins, after a plan that does not end at rest, and when the plan is too old.
+        """
+        ask = now + round(lead * NS)
+        if self._next is not None and self._next.begin <= ask:
+            self._plan, self._next = self._next, None
+        if self._plan is None or now - self._plan.start > self._lifetime * NS or ask < self._plan.begin:
+            return None
+        if ask > self._plan.end and not self._plan.ends_at_rest:
+            return None
+        return self._plan.at(ask)
+
+    def done(self, now: int) -> bool:
+        """The plan in force ended at rest, and nothing follows it."""
+        plan = self._plan
+        return plan is not None and self._next is None and plan.ends_at_rest and now >= plan.end
+
+
+def _check_jumps(plan: Plan, config: GuardConfig) -> None:
+    for k in range(len(plan.times) - 1):
+        seconds = float(plan.times[k + 1] - plan.times[k])
+        off = float(np.linalg.norm(plan.position[k + 1] - plan.position[k]))
+        angle = angle_between(_wxyz(plan.rotation[k]), _wxyz(plan.rotation[k + 1]))
+        if off > OVER * config.speed * seconds + REST or angle > OVER * config.angular_speed * seconds + REST:
+            raise InputError(
+                f"plan jumps after point {k}",
+                got=f"{1e3 * off:.1f} mm and {angle:.3f} rad in {seconds:.3f} s",
+                allowed=f"{OVER * config.speed:g} m/s and {OVER * config.angular_speed:g} rad/s",
+            )
+
+
+def _wxyz(row: Array) -> Quaternion:
+    return (float(row[0]), float(row[1]), float(row[2]), float(row[3]))
