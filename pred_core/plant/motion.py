@@ -27,7 +27,7 @@ class MotionFamily:
     sway: float = setting(0.055, unit="m", low=0.0, high=0.3, doc="largest amplitude of a sway; two sways an axis")
     sway_low: float = setting(0.25, unit="Hz", low=0.0, doc="slowest sway")
     sway_high: float = setting(0.9, unit="Hz", low=0.0, doc="fastest sway")
-    reach: float = setting(0.16, unit="m", low=0.0, high=1.0, doc="largest single move along an axis")
+    reach: float = setting(0.16, unit="m", low=0.0, high=1.0, doc="largest single move along an axis in the air")
     turn: float = setting(0.5, unit="rad", low=0.0, high=1.5, doc="largest single turn in yaw; half in pitch and roll")
     moves: int = setting(3, low=0, high=20, doc="moves an episode")
 
@@ -92,7 +92,8 @@ def draw_motion(
     turns = np.array([0.0, 0.0, 0.0, 1.0, 0.5, 0.5])
     shape = (2, 6)
     sway = generator.uniform(0.3, 1.0, shape) * (family.sway * scale + 0.2 * family.turn * turns)
-    step = generator.uniform(-1, 1, (family.moves, 6)) * (family.reach * scale + family.turn * turns)
+    drag = np.array([1.7, 1.7, 1.0, 1.0, 1.0, 1.0]) if regime == "table" else np.ones(6)  # long enough to slide it all
+    step = generator.uniform(-1, 1, (family.moves, 6)) * drag * (family.reach * scale + family.turn * turns)
     step -= 0.7 * step.mean(axis=0, keepdims=True)  # moves come back, so that the rope stays in view
     slots = seconds / max(family.moves, 1)
     return Motion(

@@ -20,6 +20,9 @@ STEP = 1.0 / 300.0  # [s]
 # MuJoCo takes the larger coefficient of a pair. Everything but the rope has none, so that the rope's counts, and an
 # effect changes friction link by link.
 NO_FRICTION = (1e-5, 1e-5, 1e-5)
+# Dry friction in a joint. With MuJoCo's usual compliance a joint that should stick creeps by 1 cm/s under the rope.
+FIRM_REF = [2.0 * STEP, 1.0]
+FIRM = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 SLIDE_ARMATURE = 1e4  # [kg] so heavy that the rope's pull, about 1 N, moves the gripper by less than 0.1 um
 TURN_ARMATURE = 1e2  # [kg m^2]
 

@@ -52,7 +52,7 @@ def plan_session(config: SessionConfig, seed: int) -> tuple[EpisodePlan, ...]:
     for split, count in (("train", config.train), ("test", config.test), ("ood", config.ood)):
         for n in range(count):
             variant = VARIANTS[1 + n % 3] if split == "ood" else VARIANTS[0]
-            regime = REGIMES[(n + (n // 3 if split == "ood" else 0)) % 2]
+            regime = REGIMES[n % 2]
             if n % PER_RECORDING == 0:
                 recordings.append([])
             recordings[-1].append((split, regime, variant))

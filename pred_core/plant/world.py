@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -145,18 +146,23 @@ def run_episode(world: World, motion: Motion, seconds: float, particles: int) ->
     arc = np.linspace(0.0, rope.length, particles)
     position = np.empty((count - settle + lead, particles, 3))
     gripper = np.empty((len(position), DOF))
-    for k in range(count):
-        world.time = (k - settle) * STEP
-        mujoco.mj_step1(world.model, world.data)
-        row = k - settle + lead
-        if row >= 0:
-            position[row] = world.material_points(arc)
-            gripper[row] = world.data.qpos[:DOF]
-        world.finish_step(drive, k, SETTLE_DRAG if world.time < -FREE else 0.0)
-    speed = float(np.abs(world.data.qvel[:3]).max()) + float(np.abs(np.diff(position, axis=0)).max() / STEP)
-    if not speed < LARGEST_SPEED or world.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+    with _mujoco_warnings() as warnings:
+        for k in range(count):
+            world.time = (k - settle) * STEP
+            mujoco.mj_step1(world.model, world.data)
+            row = k - settle + lead
+            if row >= 0:
+                position[row] = world.material_points(arc)
+                gripper[row] = world.data.qpos[:DOF]
+            world.finish_step(drive, k, SETTLE_DRAG if world.time < -FREE else 0.0)
+            if warnings:
+                break
+    speed = float(np.abs(np.diff(position[: max(row + 1, 0)], axis=0)).max(initial=0.0)) / STEP
+    if warnings or not speed < LARGEST_SPEED:
         raise DivergenceError(
-            "the rope's simulation became unstable", got=f"{speed:.3g} m/s", next_step="Use a smaller magnitude"
+            "the rope's simulation became unstable",
+            got=warnings[0] if warnings else f"{speed:.3g} m/s",
+            next_step="Use a smaller magnitude",
         )
     if world.rope.reversed:
         position = position[:, ::-1]
@@ -173,6 +179,18 @@ def lay(world: World, motion: Motion) -> None:
             at = int(world.model.joint(joint.name).qposadr[0])
             half = 0.5 * (angles[i] - angles[i - 1])
             world.data.qpos[at : at + 4] = (np.cos(half), 0.0, np.sin(half), 0.0)
+
+
+@contextlib.contextmanager
+def _mujoco_warnings() -> Iterator[list[str]]:
+    """What MuJoCo warns of meanwhile. By itself it would print it and append it to a file in the working directory."""
+    texts: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(texts.append)
+    try:
+        yield texts
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _between(at: Array, values: Array, time: Array) -> Array:

@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 
 from pred_core.plant.hidden.effect import Entry, HiddenEffect
-from pred_core.plant.rope import RopeModel
+from pred_core.plant.rope import FIRM, FIRM_REF, RopeModel
 from pred_core.plant.world import World
 
 ATTRACTION_RANGE = 0.15  # [m]
-REPULSION_RANGE = 0.04  # [m]
+REPULSION_RANGE = 0.08  # [m]
 SLIP_DAMPING = 5.0  # [N s/m] of a rope that slides in the jaws
 HELD_FAST = 1e3  # [N] friction loss of jaws that do not slip
 
@@ -26,6 +26,8 @@ class GripperSlip(HiddenEffect):
                 type=mujoco.mjtJoint.mjJNT_SLIDE,
                 axis=[0.0, 0.0, 1.0],
                 frictionloss=HELD_FAST,
+                solref_friction=FIRM_REF,
+                solimp_friction=FIRM,
                 damping=SLIP_DAMPING,
             )
 
@@ -99,13 +101,13 @@ class Repulsion(HiddenEffect):
 
 ENTRIES = (
     Entry("gripper_slip", "slip", "jaws hold at most 1/M; beyond, the rope slides along them", "1/N",
-          3.0, 50.0, GripperSlip),
+          2.5, 50.0, GripperSlip),
     Entry("gripper_offset", "gripper_offset", "rope held off the reported frame by a constant vector of it", "m",
-          0.005, 0.05, GripperOffset),
+          0.003, 0.05, GripperOffset),
     Entry("attraction", "attraction", "force m a (d/r) exp(1/2 - d^2/2r^2) to a drawn place, r = 0.15 m", "m/s^2",
-          0.3, 10.0, Attraction),
+          0.15, 10.0, Attraction),
     Entry("tether", "tether", "thread of stiffness k from a drawn point of the rope to a drawn anchor", "N/m",
-          0.1, 10.0, Tether),
-    Entry("repulsion", "repulsion", "force m a exp(-d/r) between links that are not neighbours, r = 0.04 m", "m/s^2",
-          1.0, 50.0, Repulsion, unlisted=True),
+          0.05, 3.0, Tether),
+    Entry("repulsion", "repulsion", "force m a exp(-d/r) between links more than two apart, r = 0.08 m", "m/s^2",
+          3.0, 100.0, Repulsion, unlisted=True),
 )  # fmt: skip

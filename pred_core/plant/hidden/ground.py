@@ -168,18 +168,19 @@ class TableVibration(HiddenEffect):
 
 
 ENTRIES = (
-    Entry("friction_scale", "friction", "Coulomb coefficient times 1 + a", "1", 0.3, 4.0, FrictionScale, low=-0.95),
+    Entry("friction_scale", "friction", "Coulomb coefficient times 1 + a", "1", 0.4, 4.0, FrictionScale, low=-0.95),
     Entry("friction_viscous", "friction", "force -c N v on links that touch the table", "s/m",
-          0.5, 30.0, ViscousFriction),
+          2.0, 30.0, ViscousFriction),
     Entry("friction_anisotropic", "friction", "coefficient times 1 + a cos 2(sliding direction - drawn direction)", "1",
-          0.3, 1.0, FrictionAnisotropic),
+          0.33, 1.0, FrictionAnisotropic),
     Entry("sticky_patch", "patch", "coefficient times 1 + a exp(-d^2 / 2 (0.08 m)^2) about a drawn place", "1",
-          1.0, 10.0, StickyPatch, low=-0.95),
-    Entry("table_height", "table", "the table plane stands at z = h", "m", 0.003, 0.06, TableHeight, low=-0.06),
+          2.0, 20.0, StickyPatch, low=-0.95),
+    Entry("table_height", "table", "the table plane stands at z = h", "m", 0.005, 0.06, TableHeight, low=-0.06),
     Entry("obstacle", "obstacle", "a fixed ball of radius r at a drawn place", "m", 0.02, 0.15, Obstacle),
     Entry("friction_drift", "drift", "coefficient times 1 + a t, t the time of the session", "1/min",
           0.3, 5.0, FrictionDrift, low=-0.3),
-    Entry("table_wave", "table", "ridges of height h every 0.12 m along x", "m", 0.003, 0.03, TableWave, unlisted=True),
+    Entry("table_wave", "table", "ridges of height h every 0.12 m along x", "m",
+          0.0035, 0.03, TableWave, unlisted=True),
     Entry("table_vibration", "table", "the table moves along a drawn direction as A sin(2 pi 6 Hz t)", "m",
-          0.001, 0.01, TableVibration, unlisted=True),
+          0.003, 0.01, TableVibration, unlisted=True),
 )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pred_core.plant.hidden.effect import Array, Entry, HiddenEffect
-from pred_core.plant.rope import RopeModel
+from pred_core.plant.rope import FIRM, FIRM_REF, RopeModel
 from pred_core.plant.world import World
 
 TIP = 0.1  # share of the length that is the tip
@@ -119,27 +119,29 @@ class Creep(HiddenEffect):
 
 
 class HingeFriction(HiddenEffect):
-    """One joint of the rope is damaged: dry friction holds it where it is."""
+    """One joint, where the rope often bends, is damaged: dry friction holds it where it is."""
 
     def begin(self, world: World) -> None:
         """Give one drawn joint MuJoCo's friction loss."""
-        wanted = self.generator.uniform(0.35, 0.65)
+        wanted = self.generator.uniform(0.12, 0.25)
         joint = int(np.abs(world.rope.joint_material[world.joint_link] - wanted).argmin())
         dof = int(world.joint_dof[joint])
         world.model.dof_frictionloss[dof : dof + 3] = self.magnitude
+        world.model.dof_solref[dof : dof + 3] = FIRM_REF
+        world.model.dof_solimp[dof : dof + 3] = FIRM
 
 
 ENTRIES = (
-    Entry("bending_stiffness", "bending", "joint springs times 1 + a", "1", 0.3, 20.0, BendingStiffness, low=-0.9),
+    Entry("bending_stiffness", "bending", "joint springs times 1 + a", "1", 0.4, 20.0, BendingStiffness, low=-0.9),
     Entry("stiff_region", "bending", "joint springs times 1 + a in a drawn fifth of the rope", "1",
-          1.0, 50.0, StiffRegion, low=-0.9),
-    Entry("heavy_tip", "mass", "masses of the last tenth times 1 + a", "1", 0.4, 20.0, HeavyTip, low=-0.9),
+          3.0, 20.0, StiffRegion, low=-0.9),
+    Entry("heavy_tip", "mass", "masses of the last tenth times 1 + a", "1", 1.0, 20.0, HeavyTip, low=-0.9),
     Entry("mass_gradient", "mass", "masses times 1 + a (s - 1/2)", "1", 0.4, 1.9, MassGradient, low=-1.9),
-    Entry("internal_damping", "damping", "joint dampers times 1 + a", "1", 1.0, 50.0, InternalDamping, low=-0.95),
-    Entry("creep", "plastic", "rest angles follow the angles at rate r", "1/s", 0.1, 5.0, Creep),
-    Entry("rest_curvature", "rest_shape", "rest curvature about a drawn axis", "1/m", 0.5, 20.0, RestCurvature),
+    Entry("internal_damping", "damping", "joint dampers times 1 + a", "1", 2.0, 50.0, InternalDamping, low=-0.95),
+    Entry("creep", "plastic", "rest angles follow the angles at rate r", "1/s", 0.2, 5.0, Creep),
+    Entry("rest_curvature", "rest_shape", "rest curvature about a drawn axis", "1/m", 2.0, 20.0, RestCurvature),
     Entry("stiffness_drift", "drift", "joint springs times 1 + a t, t the time of the session", "1/min",
-          0.3, 10.0, StiffnessDrift, low=-0.3),
+          0.3, 3.0, StiffnessDrift, low=-0.3),
     Entry("hinge_friction", "hinge", "dry friction in one drawn joint of the rope", "N m",
-          5e-4, 2e-2, HingeFriction, unlisted=True),
+          2e-3, 5e-2, HingeFriction, unlisted=True),
 )  # fmt: skip

@@ -48,7 +48,7 @@ def camera_place(generator: np.random.Generator) -> Array:
 
 ENTRIES = (
     Entry("action_delay", "delay", "tracks are older than their stamps", "ms", 10.0, 250.0, ActionDelay),
-    Entry("camera_scale", "camera", "tracks times 1 + a about the camera", "1", 0.005, 0.2, CameraScale, low=-0.2),
+    Entry("camera_scale", "camera", "tracks times 1 + a about the camera", "1", 0.003, 0.2, CameraScale, low=-0.2),
     Entry("camera_rotation", "camera", "tracks turned about a drawn axis through the camera", "deg",
-          0.3, 15.0, CameraRotation),
+          0.2, 15.0, CameraRotation),
 )  # fmt: skip
