@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +62,16 @@ def test_a_case_is_a_data_set(case: Path, capsys: pytest.CaptureFixture[str]) ->
     assert len(recordings) == 4 and all(len(splits) == 1 for splits in recordings.values())
 
 
+def test_an_episodes_own_held_is_checked(case: Path, tmp_path: Path) -> None:
+    for file in case.glob("*.mcap"):
+        (tmp_path / file.name).symlink_to(file)
+    text = (case / "dataset.yaml").read_text()
+    assert "    28: 0\n" in text
+    (tmp_path / "dataset.yaml").write_text(text.replace("    28: 0\n", "    28: left\n"))
+    with pytest.raises(ConfigError, match="ep0.*held.*left"):
+        load_dataset(tmp_path)
+
+
 def test_a_case_goes_on_where_it_stopped(case: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hurry(monkeypatch)
     whole = {e.name: e for e in load_dataset(case).episodes()}
@@ -100,6 +113,15 @@ def test_bad_requests_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["plant", "effects"]) == 0
     listed = capsys.readouterr().out
     assert all(name in listed for name in LIBRARY)
+
+
+def test_without_mujoco_only_this_command_is_missing(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert main(["plant", "effects"]) == 2 and "pip install mujoco" in capsys.readouterr().err
+    code = "import sys; sys.modules['mujoco'] = None; from pred_core.cli.main import main; main(['--help'])"
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=root)
+    assert done.returncode == 0 and "plant" in done.stdout, done.stderr
 
 
 def fingerprint(episode: Episode) -> str:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import importlib.util
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pred_core.bag.dataset import Dataset
 from pred_core.cli.convert_command import progress_line
 from pred_core.config import check_ranges
 from pred_core.errors import ConfigError
-from pred_core.plant.case import truth_path
-from pred_core.plant.hidden.library import LIBRARY, NONE, find_entry
-from pred_core.plant.rope_case import Hidden, write_rope_case
-from pred_core.plant.sensing import SensorConfig
 from pred_core.plant.session import SessionConfig
-from pred_core.plant.springs import write_springs_case
+
+if TYPE_CHECKING:
+    from pred_core.plant.rope_case import Hidden
+    from pred_core.plant.sensing import SensorConfig
 
 NAME = "plant"
 HELP = "Make data sets of an independent world (MuJoCo), with a hidden effect in it."
@@ -33,8 +35,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         world.add_argument("--episodes", type=int, nargs=3, default=(12, 6, 6), metavar=("TRAIN", "TEST", "OOD"))
         world.add_argument("--seconds", type=float, default=SessionConfig.seconds, help="of an episode")
         world.add_argument("--particles", type=int, default=SessionConfig.particles, help="tracked points")
-        world.add_argument("--rate", type=float, default=SensorConfig.rate, help="of the tracks [Hz]")
-        world.add_argument("--noise", type=float, default=SensorConfig.noise, help="of the tracks [m]")
+        world.add_argument("--rate", type=float, help="of the tracks [Hz]; default 30")
+        world.add_argument("--noise", type=float, help="of the tracks [m]; default 0.0007")
     rope.set_defaults(make=_rope)
     springs.set_defaults(make=_springs)
     worlds.add_parser("effects", help="list the effects that can be hidden").set_defaults(make=_effects)
@@ -42,21 +44,30 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make one data set; interrupted and started again, it goes on where it stopped. Or list the effects."""
+    # MuJoCo is an extra: what needs it is imported only here and below, so that the other commands do without.
+    if importlib.util.find_spec("mujoco") is None:
+        raise ConfigError("the plant needs MuJoCo", got="no package mujoco", next_step="pip install mujoco==4.0.0")
     return int(args.make(args))
 
 
 def _rope(args: argparse.Namespace) -> int:
+    from pred_core.plant.rope_case import write_rope_case
+
     session, sensor = _settings(args)
     hidden = hidden_effects(args.effect or [], args.magnitude or [])
     return _report(write_rope_case(args.out, hidden, args.seed, progress_line(), session=session, sensor=sensor))
 
 
 def _springs(args: argparse.Namespace) -> int:
+    from pred_core.plant.springs import write_springs_case
+
     session, sensor = _settings(args)
     return _report(write_springs_case(args.out, args.seed, progress_line(), session=session, sensor=sensor))
 
 
 def _effects(args: argparse.Namespace) -> int:
+    from pred_core.plant.hidden.library import LIBRARY
+
     print(f"{'effect':<22}{'family':<16}{'unit':<13}{'minimum':>9}{'range':>16}  law")
     for e in LIBRARY.values():
         mark = " (not meant to have a name)" if e.unlisted else ""
@@ -66,6 +77,8 @@ def _effects(args: argparse.Namespace) -> int:
 
 def hidden_effects(names: list[str], magnitudes: list[float]) -> Hidden:
     """Pairs of effect and magnitude; an effect without one gets its minimum. Raises: ConfigError."""
+    from pred_core.plant.hidden.library import NONE, find_entry
+
     if names in ([], [NONE]):
         if any(magnitudes):
             raise ConfigError("--magnitude without an effect", got=magnitudes, next_step="Name one with --effect")
@@ -77,9 +90,12 @@ def hidden_effects(names: list[str], magnitudes: list[float]) -> Hidden:
 
 
 def _settings(args: argparse.Namespace) -> tuple[SessionConfig, SensorConfig]:
+    from pred_core.plant.sensing import SensorConfig
+
     train, test, ood = args.episodes
     session = SessionConfig(train, test, ood, args.seconds, args.particles)
-    sensor = SensorConfig(rate=args.rate, noise=args.noise)
+    asked = {k: v for k, v in (("rate", args.rate), ("noise", args.noise)) if v is not None}
+    sensor = dataclasses.replace(SensorConfig(), **asked)
     check_ranges(session, "pred plant")
     check_ranges(sensor, "pred plant")
     if train + test + ood < 1:
@@ -90,6 +106,8 @@ def _settings(args: argparse.Namespace) -> tuple[SessionConfig, SensorConfig]:
 
 
 def _report(dataset: Dataset) -> int:
+    from pred_core.plant.case import truth_path
+
     counts = ", ".join(f"{len(dataset.select(s))} {s}" for s in dataset.splits)
     print(f"{dataset.root}: {len(dataset.entries)} episodes ({counts}); the truth stands in {truth_path(dataset.root)}")
     return 0

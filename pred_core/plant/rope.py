@@ -93,7 +93,6 @@ def build_rope(rope: RopeConfig, *, reversed: bool = False, gripper: bool = True
     spec.worldbody.add_geom(
         name=GROUND, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1], friction=list(NO_FRICTION)
     )
-    spec.worldbody.add_camera(name="side", pos=[0.0, -2.0, 0.7], xyaxes=[1, 0, 0, 0, 0, 1])
     parent = spec.worldbody
     if gripper:
         parent = _add_gripper(spec)
