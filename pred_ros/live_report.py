@@ -16,10 +16,12 @@ import torch
 from matplotlib.figure import Figure
 
 from pred_core.errors import ConfigError, InputError
+from pred_core.evaluate.models import NamedTwin, twin_models
 from pred_core.evaluate.protocol import FIRST_PREDICTED
-from pred_core.evaluate.scores import METRICS, REPORT_STEP, EpisodeScore, at_step, over_steps, score_episode, statistics
+from pred_core.evaluate.scores import EpisodeScore, metrics_table, over_steps, score_episode
 from pred_core.report.animation import Track, animation
 from pred_core.report.page import Page, number
+from pred_core.twin import Twin
 from pred_core.types import Episode, Grip, ObjectInfo, Tracks
 from pred_ros.scoring import Scored
 
@@ -59,8 +61,15 @@ def score(episode: Scored) -> LiveScore:
     return LiveScore(episode, EpisodeScore(episode.name, curves, found.diverged, found.hidden))
 
 
-def write_results(episodes: Sequence[Scored], model: str, out: Path) -> Summary:
+def stage_name(twin: Twin) -> str:
+    """What a twin is called when it predicts in full: spring-mass, extended or pred, as `pred evaluate` says."""
+    return twin_models(NamedTwin("", twin))[-1].name
+
+
+def write_results(episodes: Sequence[Scored], model: str, out: Path, released: int = 0) -> Summary:
     """Write `metrics.json` and `report.html` into `out`. Episodes without a prediction are listed, not averaged.
+
+    `released`: earlier episodes of a long replay that the scores do not cover.
 
     Raises: InputError if no episode can be scored; ConfigError if the folder cannot be written.
     """
@@ -77,6 +86,7 @@ def write_results(episodes: Sequence[Scored], model: str, out: Path) -> Summary:
         "entries": [_entry(model, s, [x for x in scores if x.episode.split == s]) for s in _splits(scores)],
         "frames": {"announced": sum(e.announced for e in episodes), "lost": lost},
         "episodes_without_prediction": silent,
+        "episodes_released": released,
     }
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -97,15 +107,7 @@ def _splits(scores: Sequence[LiveScore]) -> list[str]:
 
 
 def _entry(model: str, split: str, scores: Sequence[LiveScore]) -> dict[str, Any]:
-    table: dict[str, Any] = {}
-    for name, metric in METRICS.items():
-        early = {s.episode.name: at_step(s.score, name) for s in scores}
-        whole = {s.episode.name: s.mean(name) for s in scores}
-        table[name] = {
-            "unit": metric.unit,
-            f"step_{REPORT_STEP}": statistics(early, np.random.default_rng(SEED)),
-            "all_steps": statistics(whole, np.random.default_rng(SEED)),
-        }
+    table = metrics_table([s.score for s in scores], SEED)
     return {"model": model, "split": split, "episodes_tested": len(scores), "metrics": table}
 
 
@@ -129,6 +131,8 @@ def _page(scores: Sequence[LiveScore], values: dict[str, Any], model: str) -> Pa
     )
     if values["episodes_without_prediction"]:
         page.text("Without any prediction: " + ", ".join(values["episodes_without_prediction"]))
+    if values["episodes_released"]:
+        page.text(f"{values['episodes_released']} earlier episodes are not covered: the newest were kept.")
     page.figure(_curves(scores), "Mean distance error of every episode against time since its start")
     ranked = sorted(scores, key=lambda s: s.mean("mde"))
     for kind, shown in (("median", ranked[len(ranked) // 2]), ("worst", ranked[-1])):

@@ -21,7 +21,7 @@ from pred_core.evaluate.evaluation import EpisodeStore, Result, entry, run_model
 from pred_core.evaluate.models import Model, NamedTwin, twin_models
 from pred_core.evaluate.protocol import diverged_at, predict
 from pred_core.evaluate.scores import score_episode, statistics
-from pred_core.evaluate.splits import Fold, Split, grouped, published
+from pred_core.evaluate.splits import HashedFold, Split, grouped, published
 from pred_core.evaluate.where import error_by_speed, error_map, error_spectrum
 from pred_core.report import Page, Track, animation
 from pred_core.springmass.topology import build_body
@@ -93,7 +93,7 @@ def test_scores_at_step_30_and_over_all_steps_by_hand():
     episode = moved_cable(0.0)
     episode.position[1:, 1, 2] = 1e-3 * np.arange(39)
     score = score_episode(predict(Persistence(0.01), [episode])[0], episode)
-    split = Split("test", (Fold((), (), "sha", ()),), grouped=False)
+    split = Split("test", (HashedFold((), (), "sha", ()),), grouped=False)
     model = Model("persistence", "p", lambda *a: Persistence(0.01))
     made = entry(Result(model, split, (episode,), (), (score,), 0, 0), seed=0)
     mde, l1 = made["metrics"]["mde"], made["metrics"]["coordinate_l1"]

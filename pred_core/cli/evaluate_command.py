@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pred_core.bag.dataset import Dataset, load_dataset
-from pred_core.bag.gate import examine_all
 from pred_core.errors import ConfigError
 from pred_core.evaluate.cache import PredictionCache
 from pred_core.evaluate.evaluation import EpisodeStore, Result, run_all
 from pred_core.evaluate.models import BASELINES, Model, NamedTwin, baseline_models, check_fits, twin_models
+from pred_core.evaluate.quality import data_quality
 from pred_core.evaluate.report import metrics_json, write_json, write_report
 from pred_core.evaluate.splits import Split, grouped, published
 from pred_core.twin import Twin
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     progress = _Progress(sum(len(s.folds) for s in splits) * len(models))
     results, missing = run_all(models, optional, splits, store, PredictionCache(args.out / "cache"), progress)
     command = "pred " + shlex.join(["evaluate", *_words(args)])
-    gate = examine_all(store.known)
+    gate = data_quality(dataset, args.out / "cache")
     numbers = metrics_json(dataset, results, missing, gate, args.seed, command)
     write_json(args.out / "metrics.json", numbers)
     write_report(args.out / "report.html", dataset, results, numbers, twins)

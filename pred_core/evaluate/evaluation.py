@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from pred_core.bag.dataset import Dataset, EpisodeEntry
-from pred_core.errors import DatasetError, PredError
+from pred_core.errors import PredError
 from pred_core.evaluate.cache import PredictionCache
-from pred_core.evaluate.models import Model
-from pred_core.evaluate.protocol import check_episodes, predict
-from pred_core.evaluate.scores import METRICS, REPORT_STEP, EpisodeScore, at_step, over_steps, score_episode, statistics
+from pred_core.evaluate.models import Model, check_unseen
+from pred_core.evaluate.protocol import FIRST_PREDICTED, check_episodes, predict
+from pred_core.evaluate.scores import EpisodeScore, metrics_table, over_steps, score_episode
 from pred_core.evaluate.splits import Split, recordings_on_both_sides
 from pred_core.types import Array, Episode
 
@@ -60,10 +60,6 @@ class EpisodeStore:
                 self._read[entry.bag] = self.dataset.read(entry)
         return [self._read[e.bag] for e in entries]
 
-    def known(self) -> list[Episode]:
-        """Every episode read so far."""
-        return list(self._read.values())
-
 
 def run_model(model: Model, split: Split, store: EpisodeStore, cache: PredictionCache, say: Progress) -> Result:
     """Predict and score every fold of `split`. Raises: PredError of the model or the data."""
@@ -75,7 +71,7 @@ def run_model(model: Model, split: Split, store: EpisodeStore, cache: Prediction
         test = store.read(fold.test)
         check_episodes(test)
         key = cache.key(model.digest, fold.digest, number)
-        found = cache.load(key)
+        found = cache.load(key, [(len(e.stamps) - FIRST_PREDICTED, len(e.tracks.id), 3) for e in test])
         if found is None:
             dynamics = model.build(test, store.read(fold.train), number)
             found = [p.astype(np.float32).astype(np.float64) for p in predict(dynamics, test)]
@@ -83,11 +79,8 @@ def run_model(model: Model, split: Split, store: EpisodeStore, cache: Prediction
             say(f"{model.name} on {split.name}" + (f" fold {index + 1}/{len(split.folds)}" if split.grouped else ""))
         else:
             say(f"{model.name} on {split.name}: kept from before")
-        if len(found) != len(test):
-            raise DatasetError(f"{cache.folder}/{key}.npz holds {len(found)} episodes", allowed=len(test),
-                               next_step="Delete the file and run again")
-        if model.twin is not None and not split.grouped:
-            trained_on += len(set(fold.test_hashes) & set(model.twin.meta.data))
+        if not split.grouped:  # fold twins are checked before anything is predicted
+            trained_on += len(set(fold.test_hashes) & set(model.fitted_on))
         same_recording += recordings_on_both_sides(fold)
         episodes += test
         predictions += found
@@ -103,13 +96,23 @@ def run_all(
     cache: PredictionCache,
     say: Progress,
 ) -> tuple[list[Result], list[NotComputed]]:
-    """Every model on every split. A model named in `optional`, and any twin without twins for the folds of a
-    grouped split, is listed as not computed with its reason; any other failure is raised."""
+    """Every model on every split. A model named in `optional`, and any twin without equal twins for the folds of
+    a grouped split, is listed as not computed with its reason; any other failure is raised.
+
+    Raises: TwinError before anything is predicted if a fold twin was fitted on what its fold tests.
+    """
     results, missing = [], []
+    for model in models:
+        for split in splits:
+            if split.grouped and model.fold_twins == len(split.folds):
+                check_unseen(model, split.folds)
     for split in splits:
         for model in models:
             if split.grouped and model.fold_twins is not None and model.fold_twins != len(split.folds):
                 missing.append(NotComputed(model.name, split.name, _fold_reason(model, split)))
+                continue
+            if split.grouped and model.lacking:
+                missing.append(NotComputed(model.name, split.name, model.lacking))
                 continue
             try:
                 results.append(run_model(model, split, store, cache, say))
@@ -123,13 +126,6 @@ def run_all(
 def entry(result: Result, seed: int) -> dict[str, Any]:
     """The entry of one model and split in `metrics.json`. The bootstrap is drawn from `seed`, the same for all."""
     usable = [s for s in result.scores if s.diverged is None]
-    table: dict[str, Any] = {}
-    for name, metric in METRICS.items():
-        table[name] = {
-            "unit": metric.unit,
-            f"step_{REPORT_STEP}": statistics({s.name: at_step(s, name) for s in usable}, np.random.default_rng(seed)),
-            "all_steps": statistics({s.name: over_steps(s, name) for s in usable}, np.random.default_rng(seed)),
-        }
     return {
         "model": result.model.name,
         "split": result.split.name,
@@ -141,7 +137,7 @@ def entry(result: Result, seed: int) -> dict[str, Any]:
         "hidden_particle_frames": sum(s.hidden for s in result.scores),
         "tested_on_training_data": result.tested_on_training_data,
         "episodes_sharing_a_recording_with_training": result.same_recording,
-        "metrics": table,
+        "metrics": metrics_table(usable, seed),
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ import numpy as np
 from pred_core.baselines import BlendedEnds, ConstantVelocity, LastResidual, Persistence, fit_static_regression
 from pred_core.dynamics import Dynamics
 from pred_core.errors import ConfigError, DatasetError, TwinError, nearest
+from pred_core.evaluate.splits import HashedFold
 from pred_core.pred import load_dynamics
 from pred_core.twin import Twin
 from pred_core.types import Episode
@@ -28,8 +30,10 @@ class Model:
     name: str
     digest: str  # changes whenever predictions may change
     build: Build
-    twin: Twin | None = None  # shown in the report
     fold_twins: int | None = None  # number of twins for the folds of a grouped split; None: it refits itself
+    lacking: str = ""  # why the fold twins are not this model; "": they are
+    fitted_on: tuple[str, ...] = ()  # sha256 of the bags the twin saw
+    fold_fitted_on: tuple[tuple[str, ...], ...] = ()  # the same of every fold twin; empty where it stores none
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,7 @@ def twin_models(named: NamedTwin) -> list[Model]:
     if named.name:
         return [_twin_model(named.name, named, extensions=True, residual=True)]
     if twin.base is not None:
-        bases = tuple(t.base for t in named.folds if t.base is not None)
-        models = [_twin_model("spring-mass", NamedTwin("", twin.base, bases), extensions=True, residual=False)]
+        models = [_base_model(named, twin.base)]
     else:
         models = [_twin_model("spring-mass", named, extensions=False, residual=False)]
     if twin.extensions:
@@ -83,6 +86,39 @@ def check_fits(twin: Twin, episode: Episode, name: str) -> None:
     )
 
 
+def check_unseen(model: Model, folds: Sequence[HashedFold]) -> None:
+    """Raise TwinError if a fold twin was fitted on a bag its fold tests. A twin that stores no hashes passes."""
+    for index, (fold, seen) in enumerate(zip(folds, model.fold_fitted_on, strict=False)):
+        leaked = [e.bag for e, sha in zip(fold.test, fold.test_hashes, strict=True) if sha in set(seen)]
+        if leaked:
+            raise TwinError(
+                f"'{model.name}': the twin of fold {index} was fitted on {leaked[0]}, which that fold tests",
+                got=f"{len(leaked)} of {len(fold.test)} tested bags",
+                allowed="none",
+                next_step="Fit it without that fold's recordings, with the same --folds",
+            )
+
+
+def _base_model(named: NamedTwin, base: Twin) -> Model:
+    bases = tuple(t.base for t in named.folds if t.base is not None)
+    if len(bases) == len(named.folds):
+        return _twin_model("spring-mass", NamedTwin("", base, bases), extensions=True, residual=False)
+    model = _twin_model("spring-mass", NamedTwin("", base), extensions=True, residual=False)
+    return dataclasses.replace(model, fold_twins=len(named.folds), lacking="fold twins have no base")
+
+
+def _lacking(named: NamedTwin, extensions: bool, residual: bool) -> str:
+    """In which part the fold twins differ from the twin; "" if in none that this model uses."""
+    for index, fold in enumerate(named.folds):
+        if residual and (fold.residual is None) != (named.twin.residual is None):
+            return "fold twins have no residual" if fold.residual is None else "only the fold twins have a residual"
+        have, wanted = ({e.id for e in t.extensions} for t in (fold, named.twin))
+        if extensions and have != wanted:
+            return (f"the twin of fold {index} has extensions {', '.join(sorted(have)) or 'none'}, the twin has "
+                    f"{', '.join(sorted(wanted)) or 'none'}")
+    return ""
+
+
 def _twin_model(name: str, named: NamedTwin, *, extensions: bool, residual: bool) -> Model:
     def build(test: Sequence[Episode], train: Sequence[Episode], fold: int | None) -> Dynamics:
         if fold is not None and fold >= len(named.folds):
@@ -95,8 +131,10 @@ def _twin_model(name: str, named: NamedTwin, *, extensions: bool, residual: bool
         return load_dynamics(twin, extensions=extensions, residual=residual)
 
     digests = [t.digest() for t in (named.twin, *named.folds)]
-    return Model(name, f"{' '.join(digests)} extensions={extensions} residual={residual}", build, named.twin,
-                 len(named.folds))
+    return Model(
+        name, f"{' '.join(digests)} extensions={extensions} residual={residual}", build, len(named.folds),
+        _lacking(named, extensions, residual), named.twin.meta.data, tuple(t.meta.data for t in named.folds),
+    )  # fmt: skip
 
 
 def _baseline(name: str, base: NamedTwin | None) -> Model:
@@ -106,8 +144,9 @@ def _baseline(name: str, base: NamedTwin | None) -> Model:
         if base is None:
             raise ConfigError("last-residual repeats the residual of a twin", next_step="Name one with --twin")
         stage = _twin_model(f"last-residual on {base.name or 'the twin'}", base, extensions=True, residual=False)
-        digest = f"{name} {stage.digest}"
-        return Model(name, digest, lambda *args: LastResidual(stage.build(*args)), fold_twins=stage.fold_twins)
+        return dataclasses.replace(
+            stage, name=name, digest=f"{name} {stage.digest}", build=lambda *args: LastResidual(stage.build(*args))
+        )
     return Model(name, name, _BUILD[name])
 
 

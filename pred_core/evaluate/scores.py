@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -104,4 +104,16 @@ def statistics(values: Mapping[str, float], generator: np.random.Generator) -> d
         "median": float(np.median(found)) if len(found) else None,
         "episodes": len(found),
         "per_episode": kept,
+    }
+
+
+def metrics_table(scores: Sequence[EpisodeScore], seed: int) -> dict[str, Any]:
+    """Statistics of every metric over episodes that did not diverge. Each bootstrap is drawn from `seed`."""
+    return {
+        name: {
+            "unit": metric.unit,
+            f"step_{REPORT_STEP}": statistics({s.name: at_step(s, name) for s in scores}, np.random.default_rng(seed)),
+            "all_steps": statistics({s.name: over_steps(s, name) for s in scores}, np.random.default_rng(seed)),
+        }
+        for name, metric in METRICS.items()
     }

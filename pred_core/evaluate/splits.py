@@ -5,15 +5,13 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 
-from pred_core.bag.dataset import Dataset, EpisodeEntry
+from pred_core.bag.dataset import Dataset, EpisodeEntry, Fold
 
 
 @dataclass(frozen=True)
-class Fold:
-    """Episodes to test, and those a model tested on them may be fitted on."""
+class HashedFold(Fold):
+    """Episodes to test, those a model tested on them may be fitted on, and their hashes."""
 
-    test: tuple[EpisodeEntry, ...]
-    train: tuple[EpisodeEntry, ...]
     digest: str  # sha256 over names and bag hashes of both
     test_hashes: tuple[str, ...]  # sha256 of every tested bag
 
@@ -23,7 +21,7 @@ class Split:
     """A named way to test. `grouped`: several folds, models must be refitted for each."""
 
     name: str
-    folds: tuple[Fold, ...]
+    folds: tuple[HashedFold, ...]
     grouped: bool
 
 
@@ -45,11 +43,11 @@ def recordings_on_both_sides(fold: Fold) -> int:
     return sum(e.recording in trained for e in fold.test)
 
 
-def _fold(dataset: Dataset, test: tuple[EpisodeEntry, ...], train: tuple[EpisodeEntry, ...]) -> Fold:
+def _fold(dataset: Dataset, test: tuple[EpisodeEntry, ...], train: tuple[EpisodeEntry, ...]) -> HashedFold:
     sha = hashlib.sha256(repr((dataset.object, dataset.rate, dataset.gravity, dataset.held)).encode())
     hashes = {e.bag: dataset.sha256(e) for e in (*test, *train)}
     for side in (test, train):
         for entry in side:
             sha.update(f"{entry.bag} {entry.recording} {hashes[entry.bag]}\n".encode())
         sha.update(b"--\n")
-    return Fold(test, train, sha.hexdigest(), tuple(hashes[e.bag] for e in test))
+    return HashedFold(train, test, sha.hexdigest(), tuple(hashes[e.bag] for e in test))
