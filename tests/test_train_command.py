@@ -36,7 +36,8 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
         entries.append(EpisodeEntry(f"ep{i}.mcap", "train", i))
     # Nothing is held: the gripper stays at the origin, so the data set says so.
     write_dataset(root / "data", object=ObjectInfo(), rate=1.0 / PERIOD, entries=entries, held={})
-    twin = Twin(TwinMeta(period=PERIOD), line_body(), Physics(stiffness=0.1, damping=1e-6), Scene())
+    meta = TwinMeta(period=PERIOD, data=("of the backbone",))
+    twin = Twin(meta, line_body(), Physics(stiffness=0.1, damping=1e-6), Scene())
     twin.save(root / "twin")
     return root
 
@@ -82,10 +83,13 @@ def whole(case: Path) -> bytes:
 def test_writes_a_twin_that_predicts_and_a_report(case: Path, whole: bytes) -> None:
     twin = Twin.load(case / "whole")
     assert isinstance(load_dynamics(twin), PReD)
-    assert twin.meta.parent == Twin.load(case / "twin").digest() and len(twin.meta.data) == 4
+    assert twin.meta.parent == Twin.load(case / "twin").digest() and len(twin.meta.data) == 5
+    assert twin.meta.data[0] == "of the backbone", "what the twin was identified on still counts as seen"
     report = json.loads((case / "whole" / "train.json").read_text())
     assert len(report["curves"]["loss"]) == 100 and report["network"]["cap"] == 0.2
-    assert "--steps 100" in report["command"]
+    assert f"--out {case / 'whole'} " in report["command"] and "--no-azimuth" not in report["command"]
+    assert "--steps 100 " in report["command"] and "--learning-rate 0.001 " in report["command"], "defaults too"
+    assert report["command"] == twin.meta.created_by
     assert "share of components at the cap" in (case / "whole" / "train.html").read_text()
     assert not (case / "whole" / CHECKPOINT).exists()
 
@@ -104,6 +108,8 @@ def test_resumed_after_a_signal_equals_uninterrupted(case: Path, whole: bytes, n
     assert resumed.returncode == 0, errors
     assert "resumed at step" in errors
     assert (out / "residual.safetensors").read_bytes() == whole
+    made_by = [Twin.load(p).meta.created_by.replace(str(p), "OUT") for p in (out, case / "whole")]
+    assert made_by[0] == made_by[1], "a resumed run tells the settings it was begun with"
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,10 @@ import torch
 from residual_case import PERIOD, Falling, episodes, line_body
 
 from pred_core.errors import DatasetError
+from pred_core.identify.windows import draw_windows
 from pred_core.train import Recording, align
 from pred_core.train.outliers import backbone_error, leave_out
-from pred_core.train.recordings import gather, split_groups, window_index
+from pred_core.train.recordings import gather, split_groups, start_frames, window_index
 from pred_core.types import Episode, Grip
 
 
@@ -65,6 +66,17 @@ def test_windows_start_where_everything_is_measured() -> None:
     assert batch.target[0, 0, 2].tolist() == [0.0, 0.0, 0.0]
     with pytest.raises(DatasetError, match="20 periods"):
         window_index([recording], 20, 1)
+
+
+def test_windows_never_start_where_a_gripper_has_closed_anew() -> None:
+    # Closed at frames 0-2 and again at 5-6: what it holds then is not told. Frame 0 has no velocity.
+    (episode,) = episodes(Falling(), 1, 10, seed=0)
+    closed = torch.tensor([1, 1, 1, 0, 0, 1, 1, 0, 0, 0], dtype=torch.bool)[:, None]
+    grips = Grip(episode.grips.position, episode.grips.rotation, closed)
+    recording = align(dataclasses.replace(episode, grips=grips), line_body(), PERIOD)
+    assert torch.nonzero(start_frames(recording)).flatten().tolist() == [1, 2, 3, 4, 7, 8, 9]
+    assert window_index([recording], 2, 1)[:, 1].tolist() == [1, 2, 3, 4, 7]
+    assert draw_windows([recording], 2, 100, torch.Generator().manual_seed(0))[:, 1].tolist() == [1, 2, 3, 4, 7]
 
 
 def test_batch_reproduces_the_recording() -> None:

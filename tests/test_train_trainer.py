@@ -204,4 +204,4 @@ def test_report_holds_curves_and_share_at_the_cap(tmp_path: Path) -> None:
     assert stored["curves"]["loss"] == run.curves.loss and len(stored["curves"]["binding"]) == 8
     assert stored["seed"] == 5 and stored["parameters"] > 1000
     page = (tmp_path / "train.html").read_text()
-    assert "&lt;data&gt;" in page and "share of components at the cap" in page and "data:image/png" in page
+    assert "&lt;data&gt;" in page and "share of components at the cap" in page and "data:image/svg+xml" in page

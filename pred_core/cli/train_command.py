@@ -73,8 +73,10 @@ def run(args: argparse.Namespace) -> int:
     if not done:
         _tell(f"stopped after step {trainer.step}; go on with --resume")
         return INTERRUPTED
-    command = shlex.join(["pred", "train", str(args.dataset), "--twin", str(args.twin)] + _given_flags(args))
-    meta = dataclasses.replace(twin.meta, created_by=command, parent=source["twin"], data=tuple(hashes))
+    files = [str(args.dataset), "--twin", str(args.twin), "--out", str(out), "--device", args.device]
+    command = shlex.join(["pred", "train", *files, *_flags(training), *_flags(network)])
+    data = tuple(dict.fromkeys((*twin.meta.data, *hashes)))  # the backbone's bags count as seen too
+    meta = dataclasses.replace(twin.meta, created_by=command, parent=source["twin"], data=data)
     twin.replace(residual=trainer.chosen().weights(), meta=meta).save(out)
     write_report(out, trainer.summary(), command)
     checkpoint.unlink()
@@ -145,16 +147,12 @@ def _add_flag(group: argparse._ArgumentGroup, field: dataclasses.Field[Any], hin
         group.add_argument(name, dest=field.name, type=hint, choices=choices, default=None, help=text)
 
 
-def _given_flags(args: argparse.Namespace) -> list[str]:
-    """The configuration flags of this command line, as they would be typed."""
+def _flags(config: TrainingConfig | ResidualConfig) -> list[str]:
+    """Every setting as it would be typed, defaults too: they may change, and a resumed run is given none."""
     flags: list[str] = []
-    for config in (TrainingConfig, ResidualConfig):
-        for field in dataclasses.fields(config):
-            value, name = getattr(args, field.name), field.name.replace("_", "-")
-            if isinstance(value, bool):
-                flags.append(f"--{name}" if value else f"--no-{name}")
-            elif value is not None:
-                flags += [f"--{name}", str(value)]
+    for field in dataclasses.fields(config):
+        value, name = getattr(config, field.name), field.name.replace("_", "-")
+        flags += [f"--{name}" if value else f"--no-{name}"] if isinstance(value, bool) else [f"--{name}", str(value)]
     return flags
 
 

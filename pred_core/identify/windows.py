@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pred_core.errors import DatasetError
 from pred_core.identify.starts import estimate_start
-from pred_core.train.recordings import Recording, gather
+from pred_core.train.recordings import Recording, gather, start_frames
 from pred_core.types import Grip, State
 
 
@@ -78,14 +78,7 @@ def draw_windows(recordings: Sequence[Recording], steps: int, count: int, genera
 
 def _starts(recording: Recording, steps: int) -> list[int]:
     """Frames where windows of a recording start: every half window, moved on to where a start is known."""
-    closed = recording.grips.closed
-    # What a gripper holds is told for the first frame; after it closes anew, it is not known.
-    told = (closed == closed.cumprod(dim=0).bool()).all(dim=1)
-    whole = torch.isfinite(recording.position).flatten(1).all(dim=1)
-    usable = told & whole
-    usable[1:] &= whole[:-1]
-    usable[0] = False
-    frames = torch.nonzero(usable).flatten().tolist()
+    frames = torch.nonzero(start_frames(recording)).flatten().tolist()
     last = max(len(recording.position) - 1 - steps, 1)
     begins: list[int] = []
     for wanted in range(1, last + 1, max(steps // 2, 1)):

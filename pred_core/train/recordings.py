@@ -12,7 +12,7 @@ from torch import Tensor
 from pred_core.errors import DatasetError
 from pred_core.types import Body, Episode, Grip, State
 
-PERIOD_TOLERANCE = 0.01  # relative; a rate that differs more is another clock
+PERIOD_TOLERANCE = 0.02  # relative difference of a twin's period and the frames' that clocks explain
 
 
 @dataclass(frozen=True)
@@ -93,17 +93,30 @@ def split_groups(
     return [r for r in recordings if r.group not in chosen], [r for r in recordings if r.group in chosen]
 
 
+def start_frames(recording: Recording) -> Tensor:
+    """(T,) bool: frames a window may start at, for fitting and for training alike.
+
+    Every particle is measured there and at the frame before, and what each gripper holds is known: it is told for
+    the first frame; after a gripper has closed anew, it is not known until it opens again.
+    """
+    closed = recording.grips.closed
+    usable = (closed == closed.cumprod(dim=0).bool()).all(dim=1)
+    whole = torch.isfinite(recording.position).flatten(1).all(dim=1)
+    usable &= whole
+    usable[1:] &= whole[:-1]
+    usable[0] = False
+    return usable
+
+
 def window_index(recordings: Sequence[Recording], steps: int, stride: int) -> Tensor:
     """(M, 2) int64: recording and start frame of every window of `steps` periods.
 
-    A window starts where every particle is measured at its start and the frame before.
-    Raises: DatasetError if there is none.
+    A window starts at one of `start_frames`. Raises: DatasetError if there is none.
     """
     rows = []
     for r, recording in enumerate(recordings):
-        whole = torch.isfinite(recording.position).flatten(1).all(dim=1)
         frames = torch.arange(1, max(len(recording.position) - steps, 1), stride)
-        frames = frames[whole[frames] & whole[frames - 1]]
+        frames = frames[start_frames(recording)[frames]]
         rows.append(torch.stack((torch.full_like(frames, r), frames), dim=-1))
     index = torch.cat(rows) if rows else torch.zeros(0, 2, dtype=torch.int64)
     if not len(index):

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -12,15 +9,17 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from pred_core.report import Page
+
 
 def write_report(directory: Path, summary: dict[str, Any], command: str) -> None:
     """Write both files. `summary` is `Trainer.summary()`."""
     directory.mkdir(parents=True, exist_ok=True)
     (directory / "train.json").write_text(json.dumps({"command": command, **summary}, indent=1), encoding="utf-8")
-    (directory / "train.html").write_text(_page(summary, command), encoding="utf-8")
+    _page(summary, command).write(directory / "train.html")
 
 
-def _page(summary: dict[str, Any], command: str) -> str:
+def _page(summary: dict[str, Any], command: str) -> Page:
     curves = summary["curves"]
     rows = {"step kept": f"{summary['best_step']} of {summary['step']}"}
     if curves["held_out_mm"]:
@@ -40,27 +39,25 @@ def _page(summary: dict[str, Any], command: str) -> str:
         "time [s]": f"{summary['seconds']:.0f}",
     }
     settings = {**summary["training"], **{f"network.{k}": v for k, v in summary["network"].items()}}
-    return f"""<!doctype html><meta charset="utf-8"><title>Residual training</title>
-<style>body{{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}}
-td{{padding:.1em 1em .1em 0;vertical-align:top}}img{{max-width:100%}}</style>
-<h1>Residual training</h1><p><code>{html.escape(command)}</code></p>
-<p>Errors are mean absolute per coordinate. Held-out recordings are train recordings that the network is not fitted
-on; they choose the step that is kept. A component is at the cap beyond 95 % of it.</p>
-{_table(rows)}<img alt="loss curves" src="data:image/png;base64,{_curves(curves)}">
-<h2>Settings</h2>{_table(settings)}"""
+    page = Page("Residual training")
+    page.code(command)
+    page.text(
+        "Errors are mean absolute per coordinate. Held-out recordings are train recordings that the network is not "
+        "fitted on; they choose the step that is kept. A component is at the cap beyond 95 % of it."
+    )
+    page.table(("", "value"), list(rows.items()))
+    page.figure(_curves(curves), "Error of windows and of held-out recordings, and share of components at the cap.")
+    page.heading("Settings")
+    page.table(("setting", "value"), list(settings.items()))
+    return page
 
 
 def _tail(values: list[float]) -> float:
     return float(np.mean(values[-max(1, len(values) // 10) :])) if values else 0.0
 
 
-def _table(rows: dict[str, Any]) -> str:
-    cells = (f"<tr><td>{html.escape(str(k))}</td><td>{html.escape(str(v))}</td></tr>" for k, v in rows.items())
-    return f"<table>{''.join(cells)}</table>"
-
-
-def _curves(curves: dict[str, Any]) -> str:
-    """PNG, base64: windows' error and held-out error over steps, and the share at the cap."""
+def _curves(curves: dict[str, Any]) -> Figure:
+    """Windows' error and held-out error over steps, and the share at the cap."""
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     steps = 1 + np.arange(len(curves["error_mm"]))
@@ -74,6 +71,4 @@ def _curves(curves: dict[str, Any]) -> str:
     bottom.set_ylabel("share at the cap")
     bottom.set_xlabel("optimiser step")
     top.legend()
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110)
-    return base64.b64encode(stream.getvalue()).decode()
+    return figure
