@@ -144,11 +144,13 @@ class Line:
     def __init__(self, springs: SpringsConfig, particles: int):
         self.config = springs
         self.spacing = springs.length / (particles - 1)
-        self.mass = springs.mass / particles  # [kg] of a particle
+        share = np.ones(particles)  # half of each neighbouring edge
+        share[[0, -1]] = 0.5
+        self.mass: Array = springs.mass * share / share.sum()  # (P,) [kg]
 
     def step(self, x: Array, v: Array, held: Array, drag: float, h: float) -> tuple[Array, Array]:
         """(position, velocity) (E, P, 3) after h [s]; `held` (E, HELD, 3) is where the jaws are then."""
-        v = v + h * (self.force(x, v) / self.mass - drag * v)
+        v = v + h * (self.force(x, v) / self.mass[:, None] - drag * v)
         v[..., 2] += h * STANDARD_GRAVITY[2]
         # Contact: no penetration after the step; friction takes at most mu times the normal change of velocity.
         gap = x[..., 2]
