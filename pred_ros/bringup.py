@@ -71,13 +71,15 @@ def run(nodes: dict[str, dict[str, Any]], domain: int | None, logs: Path | None)
     with Children(node_environment(domain), folder) as children:
         for name, parameters in nodes.items():
             children.start(name, node_command(name, parameters))
-        while not asked and any(p.poll() is None for p in children.running.values()):
-            for name, process in children.running.items():
-                if process.poll() not in (None, 0):
+        while True:
+            codes = {name: process.poll() for name, process in children.running.items()}
+            for name, code in codes.items():
+                if code not in (None, 0):
                     print(f"pred_bringup: {name} ended: {children.last_line(name)}", file=sys.stderr)
-                    return int(process.returncode)
+                    return int(code)
+            if asked or None not in codes.values():
+                return 0
             time.sleep(0.1)
-    return 0
 
 
 if __name__ == "__main__":

@@ -20,12 +20,14 @@ from std_msgs.msg import String
 from pred_core.bag.wire import PREDICTION_POINTS, TRACKER_POINTS
 from pred_core.config import setting
 from pred_core.errors import ConfigError, PredError
+from pred_core.twin import Twin
 from pred_ros import convert, marks, qos, shell
 from pred_ros.diagnostics import ERROR, OK, WARN
-from pred_ros.live_report import write_results
+from pred_ros.live_report import stage_name, write_results
 from pred_ros.scoring import Scorer
 from pred_ros.shell import Shell
 
+UNNAMED = "prediction"  # the model, if neither `model` nor `twin` says more
 REFUSED_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
 
 
@@ -34,7 +36,8 @@ class EvaluatorConfig:
     """Parameters of the evaluator."""
 
     out: str = setting("out/live", doc="folder for metrics.json and report.html")
-    model: str = setting("pred", doc="name of the predictor in metrics.json")
+    model: str = setting("", doc="name of the predictor in metrics.json; empty: the stage of `twin`")
+    twin: str = setting("", doc="folder of the twin that predicts; names the model")
     tolerance: float = setting(0.001, unit="s", low=0.0, high=1.0, doc="how far apart the stamps of a pair may be")
     patience: float = setting(
         10.0, unit="s", low=0.1, high=600.0, doc="wait for missing data after the end of the replay"
@@ -52,11 +55,8 @@ class EvaluatorNode(Shell):
     def __init__(self) -> None:
         super().__init__()
         self._inputs: list[Subscription] = []
-        self._scorer = Scorer(self.config.tolerance)
-        self._ended: marks.EndMark | None = None
-        self._news = time.monotonic()  # [s] when data last came
         self._refused = ""
-        self._written = False
+        self._begin_anew()
 
     def setup(self) -> None:
         """Make the output folder: a run must not fail at its end."""
@@ -64,6 +64,15 @@ class EvaluatorNode(Shell):
             Path(self.config.out).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError("parameter 'out': the folder cannot be made", got=error) from error
+        config: EvaluatorConfig = self.config
+        self._model = config.model or (stage_name(Twin.load(Path(config.twin))) if config.twin else UNNAMED)
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        self._scorer = Scorer(self.config.tolerance)
+        self._ended: marks.EndMark | None = None
+        self._news = time.monotonic()  # [s] when data last came
+        self._written = False
 
     def start(self) -> None:
         """Subscribe."""
@@ -96,6 +105,7 @@ class EvaluatorNode(Shell):
         self.diagnostics.value("tracker/points", str(points))
         self.diagnostics.value("prediction/points", str(predictions))
         self.diagnostics.value("pairs", str(self._scorer.pairs))
+        self.diagnostics.value("episodes released", str(self._scorer.released))
         refused_age = self.diagnostics.age("refused message")
         if refused_age is not None and refused_age < REFUSED_SHOWN:
             self.report(ERROR, self._refused)
@@ -108,7 +118,7 @@ class EvaluatorNode(Shell):
         if self._ended is None or self._written:
             return
         waited = time.monotonic() - self._news
-        announced = len(self._scorer.marks) >= self._ended.episodes
+        announced = self._scorer.announced >= self._ended.episodes
         if (announced and self._scorer.complete()) or waited > self.config.patience:
             try:
                 self._write()
@@ -120,7 +130,7 @@ class EvaluatorNode(Shell):
 
     def _write(self) -> None:
         self._written = True
-        summary = write_results(self._scorer.episodes(), self.config.model, Path(self.config.out))
+        summary = write_results(self._scorer.episodes(), self._model, Path(self.config.out), self._scorer.released)
         self.report(WARN if summary.lost else OK, summary.line)
         print(f"{self.NAME}: {summary.line}", flush=True)
 

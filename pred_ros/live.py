@@ -29,7 +29,7 @@ class Replay:
     split: str = "test"
     episodes: tuple[str, ...] = ()  # names; empty: all of the split
     factor: float = 1.0  # x real time
-    model: str = "pred"
+    model: str = ""  # name in the report; empty: the stage of the twin
     extra: float = 60.0  # [s] beyond start and playing time before everything is ended
 
 
@@ -56,7 +56,7 @@ def replay(job: Replay, terminal: TextIO = sys.stderr) -> dict[str, Any]:
 def _parameters(job: Replay) -> dict[str, Mapping[str, object]]:
     held = load_dataset(job.dataset).held
     return {
-        "evaluator": {"out": job.out, "model": job.model},
+        "evaluator": {"out": job.out, "model": job.model, "twin": job.twin},
         "predictor": {
             "twin": job.twin,
             "held": " ".join(f"{p}:{g}" for p, g in (held or {}).items()),

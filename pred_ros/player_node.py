@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,7 @@ from pred_ros.shell import Shell
 
 LATE = 0.05  # [s] behind its schedule before the player says so
 FLUSH = 20.0  # [s] for the readers to acknowledge the last messages
+SLICE = 0.1  # [s] of that at once
 _CLASSES: dict[str, type] = {TRACKER_POINTS: PointCloud2, GRIPPER_POSE: PoseArray, GRIPPER_CLOSED: UInt8MultiArray}
 
 
@@ -54,6 +56,18 @@ class PlayerConfig:
     patience: float = setting(30.0, unit="s", low=0.1, high=3600.0, doc="longest wait for readers")
     clock: bool = setting(False, doc="publish /clock")
     autostart: bool = setting(True, doc="configure and activate without a lifecycle manager")
+
+
+def unacknowledged(outs: Mapping[str, Publisher], limit: float, halted: Callable[[], bool]) -> list[str]:
+    """Topics whose readers did not acknowledge everything within `limit` [s]; looks at `halted` every SLICE."""
+    deadline = time.monotonic() + limit
+    waiting = list(outs)
+    while waiting and not halted():
+        if outs[waiting[0]].wait_for_all_acked(Duration(seconds=SLICE)):
+            waiting.pop(0)
+        elif time.monotonic() > deadline:
+            break
+    return waiting
 
 
 class PlayerNode(Shell):
@@ -153,8 +167,9 @@ class PlayerNode(Shell):
             if not self.config.loop:
                 break
         self._marks_out.publish(String(data=marks.encode(marks.EndMark(played))))
-        lost = [t for t, out in self._out.items() if not out.wait_for_all_acked(Duration(seconds=FLUSH))]
-        self._marks_out.wait_for_all_acked(Duration(seconds=FLUSH))
+        lost = unacknowledged({**self._out, marks.TOPIC: self._marks_out}, FLUSH, self._halt.is_set)
+        if self._halt.is_set():
+            return
         if lost:
             raise InputError(f"a reader of {', '.join(lost)} did not take everything within {FLUSH:g} s")
         self.report(OK, f"end of data: {played} episodes, {self.diagnostics.counter('messages')} messages")

@@ -7,7 +7,7 @@ for each period of measured gripper poses: exactly what the offline evaluation d
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 import torch
@@ -21,10 +21,11 @@ from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
 from pred_core.dynamics import Dynamics
 from pred_core.errors import DivergenceError, InputError, TwinError
 from pred_core.types import Grip, State
+from pred_ros.laps import Laps, Time
 from pred_ros.prediction_records import Counts, Pose, Prediction, Rules, grip_of
 
 ON_GRID = 0.25  # periods; a pose this close to the next step is taken as it is
-MAX_WAITING = 4_000  # tracker frames kept while poses are awaited
+MAX_WAITING = 4_000  # tracker frames kept while poses are awaited, and poses while frames are
 
 
 class Predictor:
@@ -36,13 +37,14 @@ class Predictor:
         self._held = held
         self._rules = rules
         self._period = round(dynamics.period * 1e9)  # [ns]
-        self._frames: deque[tuple[tuple[int, int], PointFrame]] = deque()
+        self._frames: deque[tuple[Time, PointFrame]] = deque()
         self._poses: deque[Pose] = deque()
-        self._frame_lap = self._pose_lap = 0
-        self._newest_frame = self._newest_pose = -(2**62)  # [ns]
+        self._laps: Laps[Callable[[Time], None]] = Laps(rules.max_gap)
+        self._pose_lap = 0
         self._state: State | None = None
-        self._time: tuple[int, int] = (-1, 0)  # of the state
-        self._begin: tuple[int, int] = (-1, 0)  # frames before it belong to what is over
+        self._time: Time = (-1, 0)  # of the state
+        self._begin: Time = (-1, 0)  # frames before it belong to what is over
+        self._cancelled = False
         self._before: Pose | None = None  # the last pose at or before the state's next time
         self.halted: DivergenceError | None = None
         self.counts = Counts()
@@ -58,32 +60,38 @@ class Predictor:
         return len(self._poses) * self._dynamics.period if self.running else 0.0
 
     def reset(self) -> None:
-        """End the run; the next one starts from the tracker frames that follow."""
+        """End the run and forget all stamps; the next run starts from the tracker frames that follow."""
         self._state = self._before = None
         self.halted = None
         self._frames.clear()
         self._poses.clear()
+        self._laps.clear()
+        self._pose_lap, self._time, self._begin = 0, (-1, 0), (-1, 0)
+
+    def cancel(self) -> None:
+        """End `advance` at its next step, within a long horizon too; for another thread, at the end of all."""
+        self._cancelled = True
 
     def add_points(self, frame: PointFrame) -> None:
-        """A tracker frame. Raises: TwinError if it has particles the twin does not know."""
+        """A tracker frame; without points, nothing is seen.
+
+        Raises: TwinError if it has particles the twin does not know; InputError for its stamp (laps.py).
+        """
         unknown = np.setdiff1d(frame.id, self._ids)
-        if len(unknown) or not len(frame.id):
+        if len(unknown):
             raise TwinError(
                 "the particle ids of tracker/points do not match the twin",
                 got=f"{len(unknown)} unknown ids, e.g. {unknown[:5].tolist()}",
                 allowed=f"{len(self._ids)} ids, {self._ids.min()} to {self._ids.max()}",
                 next_step="Give the twin that was identified on this object's tracks",
             )
-        if self._jumped(TRACKER_POINTS, frame.stamp, self._newest_frame):
-            self._frame_lap += 1
-        self._newest_frame = frame.stamp
-        self._frames.append(((self._frame_lap, frame.stamp), frame))
-        if len(self._frames) > MAX_WAITING:
-            self._frames.popleft()
-            self.counts.dropped_frames += 1
+        self._take(TRACKER_POINTS, frame.stamp, lambda time: self._keep_frame(time, frame))
 
     def add_pose(self, pose: PoseFrame, closed: NDArray[np.bool_]) -> None:
-        """A gripper pose. Raises: InputError if the flags do not match or a held particle has no gripper."""
+        """A gripper pose.
+
+        Raises: InputError if the flags do not match, a held particle has no gripper, or for its stamp (laps.py).
+        """
         count = len(pose.position)
         if len(closed) != count:
             raise InputError(
@@ -92,11 +100,7 @@ class Predictor:
         needed = max(self._held.values(), default=-1) + 1 if self._held else 0
         if count < needed:
             raise InputError(f"{GRIPPER_POSE}: too few grippers for 'held'", got=count, allowed=f"{needed} or more")
-        if self._jumped(GRIPPER_POSE, pose.stamp, self._newest_pose):
-            self._pose_lap += 1
-            self.counts.jumps += 1
-        self._newest_pose = pose.stamp
-        self._poses.append(Pose(pose, closed, self._pose_lap))
+        self._take(GRIPPER_POSE, pose.stamp, lambda time: self._keep_pose(Pose(pose, closed, time[0])))
 
     def advance(self) -> Iterable[Prediction]:
         """Predictions that the data so far allow, oldest first.
@@ -104,7 +108,7 @@ class Predictor:
         Raises: DivergenceError when the simulation leaves the finite numbers; the run is then halted
         until `reset` or a jump or gap in the poses.
         """
-        while self._poses:
+        while self._poses and not self._cancelled:
             if self._state is None:
                 if self.halted is not None:
                     if not self._ends_run(self._poses[0]):
@@ -122,15 +126,33 @@ class Predictor:
             if prediction is not None:
                 yield prediction
 
-    def _jumped(self, topic: str, stamp: int, newest: int) -> bool:
-        """True for a jump back in time (a loop). Raises: InputError if a message is merely late or repeated."""
-        if stamp > newest:
-            return False
-        if newest - stamp <= self._rules.max_gap * 1e9:
-            raise InputError(
-                f"{topic}: time runs backwards", got=f"stamp {stamp * 1e-9:.6f} s after {newest * 1e-9:.6f} s"
-            )
-        return True
+    def _take(self, topic: str, stamp: int, keep: Callable[[Time], None]) -> None:
+        for time, action in self._laps.take(topic, stamp, keep):
+            action(time)
+
+    def _keep_frame(self, time: Time, frame: PointFrame) -> None:
+        while self._frames and self._frames[-1][0] >= time:  # their stamps were out of line
+            self._frames.pop()
+            self.counts.dropped_frames += 1
+        self._frames.append((time, frame))
+        if len(self._frames) > MAX_WAITING:
+            self._frames.popleft()
+            self.counts.dropped_frames += 1
+
+    def _keep_pose(self, pose: Pose) -> None:
+        while self._poses and self._poses[-1].time >= pose.time:  # their stamps were out of line
+            self._poses.pop()
+            self.counts.dropped_poses += 1
+        if self._before is not None and self._before.time >= pose.time:
+            self._end_run(pose)
+        self._begin = min(self._begin, pose.time)
+        if pose.lap > self._pose_lap:
+            self._pose_lap = pose.lap
+            self.counts.jumps += 1
+        self._poses.append(pose)
+        if self._state is None and len(self._poses) > MAX_WAITING:
+            self._before = self._poses.popleft()
+            self.counts.dropped_poses += 1
 
     def _ends_run(self, pose: Pose) -> bool:
         if self._before is None:
@@ -230,7 +252,7 @@ class Predictor:
         )
         raise self.halted
 
-    def _ahead(self, stamp: int, state: State, grip: Grip, previous: Pose) -> Prediction:
+    def _ahead(self, stamp: int, state: State, grip: Grip, previous: Pose) -> Prediction | None:
         count = round(self._rules.horizon / self._dynamics.period)
         if count == 0:
             return Prediction(stamp, state, stamp, state)
@@ -238,6 +260,8 @@ class Predictor:
         velocity = (grip.position - torch.as_tensor(previous.pose.position, dtype=torch.float32)) / elapsed
         ahead = state
         for k in range(1, count + 1):
+            if self._cancelled:
+                return None
             moved = Grip(grip.position + velocity * (k * self._dynamics.period), grip.rotation, grip.closed)
             ahead = self._stepped(ahead, moved, stamp + k * self._period)
         return Prediction(stamp, state, stamp + count * self._period, ahead)

@@ -59,7 +59,8 @@ class Counts:
     unused_poses: int = 0  # faster than the period
     gaps: int = 0  # holes in the poses that ended a run
     jumps: int = 0  # jumps back in time
-    dropped_frames: int = 0  # tracker frames that waited too long for poses
+    dropped_frames: int = 0  # tracker frames that waited too long for poses, or whose stamps were out of line
+    dropped_poses: int = 0  # poses that waited too long for tracker frames, or whose stamps were out of line
     waiting_for: list[int] = field(default_factory=list)  # particle ids a start lacks
     spacing: float = 1.0  # periods between the two frames that were last refused as a start
 

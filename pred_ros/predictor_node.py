@@ -36,6 +36,8 @@ from pred_ros.shell import Shell
 
 KEPT = 8  # newest messages that survive an overload: four frames with their poses, enough for a start
 REFUSED_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
+COUNTS_SHOWN = ("runs", "steps", "interpolated", "unused_poses", "gaps", "jumps", "dropped_frames", "dropped_poses")
+OVERLOAD_SHOWN = 5.0  # [s] how long dropped messages do
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,8 @@ class PredictorNode(Shell):
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="prediction")
         self._inputs: list[Subscription] = []
         self._closed: NDArray[np.bool_] | None = None
-        self._refused = ""
+        self._refused = self._overload = ""
+        self._stopping = False
 
     def setup(self) -> None:
         """Load the twin."""
@@ -119,6 +122,7 @@ class PredictorNode(Shell):
         rules = Rules(max_gap=config.max_gap, horizon=config.horizon, correct=config.correct)
         self._predictor = Predictor(self._dynamics, self._ids, self._held, rules)
         self._inbox = queue.SimpleQueue()
+        self._stopping = False
         self._worker = self._pool.submit(self._work)
         self._starter = self.create_timer(0.02, self._subscribe_when_heard)
         self._watch = self.create_timer(0.05, self._check_worker)
@@ -134,6 +138,7 @@ class PredictorNode(Shell):
             self.destroy_timer(timer)
         self._inputs = []
         self._stopping = True
+        self._predictor.cancel()
         self._inbox.put(None)
         self._pool.shutdown(wait=True)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="prediction")
@@ -141,7 +146,7 @@ class PredictorNode(Shell):
     def changed(self, config: PredictorConfig) -> None:
         """Everything but the thresholds is fixed while the node runs."""
         parse_held(config.held)
-        names = ("twin", "held", "horizon", "correct", "max_gap", "wait_for", "threads", "autostart")
+        names = ("twin", "held", "horizon", "correct", "max_gap", "overload", "wait_for", "threads", "autostart")
         fixed = [n for n in names if getattr(config, n) != getattr(self.config, n)]
         if fixed and self._worker is not None:
             raise ConfigError(
@@ -153,16 +158,19 @@ class PredictorNode(Shell):
         if self._worker is None:
             return
         counts = self._predictor.counts
-        for name in ("runs", "steps", "interpolated", "unused_poses", "gaps", "jumps", "dropped_frames"):
+        for name in COUNTS_SHOWN:
             self.diagnostics.value(name, str(getattr(counts, name)))
         self.diagnostics.value("waiting inbox", str(self._inbox.qsize()))
         age, frame_age = self.diagnostics.age(GRIPPER_POSE), self.diagnostics.age(TRACKER_POINTS)
         refused_age = self.diagnostics.age("refused message")
+        overload_age = self.diagnostics.age("dropped messages")
         limit = max(self.config.max_gap, 0.2)
         if self._predictor.halted is not None:
             self.report(ERROR, str(self._predictor.halted))
         elif refused_age is not None and refused_age < REFUSED_SHOWN:
             self.report(ERROR, self._refused)
+        elif overload_age is not None and overload_age < OVERLOAD_SHOWN:
+            self.report(WARN, self._overload)
         elif age is None or age > limit:
             since = "never came" if age is None else f"stopped {age:.1f} s ago"
             self.report(
@@ -185,11 +193,12 @@ class PredictorNode(Shell):
     def _subscribe_when_heard(self) -> None:
         if self._inputs or self._prediction_out.get_subscription_count() < self.config.wait_for:
             return
-        complete = qos.points_complete()
+        queued = self.config.overload == "queue"
+        poses, points = (qos.points_complete(),) * 2 if queued else (qos.poses_live(), qos.points_live())
         self._inputs = [
-            self.create_subscription(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed, complete),
-            self.create_subscription(PoseArray, GRIPPER_POSE, self._on_pose, complete),
-            self.create_subscription(PointCloud2, TRACKER_POINTS, self._on_points, complete),
+            self.create_subscription(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed, poses),
+            self.create_subscription(PoseArray, GRIPPER_POSE, self._on_pose, poses),
+            self.create_subscription(PointCloud2, TRACKER_POINTS, self._on_points, points),
         ]
         self._starter.cancel()
 
@@ -238,7 +247,6 @@ class PredictorNode(Shell):
     # Below: the worker thread. It alone touches the Predictor's state.
 
     def _work(self) -> None:
-        self._stopping = False
         while not self._stopping and (action := self._inbox.get()) is not None:
             try:
                 with torch.no_grad():
@@ -279,8 +287,10 @@ class PredictorNode(Shell):
                 return
             dropped += 1
         self._predictor.reset()
-        self.diagnostics.count("dropped messages", dropped)
-        self.report(WARN, f"too slow: {dropped} messages dropped, starting anew from the newest data")
+        total = self.diagnostics.count("dropped messages", dropped)
+        self._overload = f"too slow: {dropped} messages dropped ({total} so far), starting anew from the newest data"
+        self.diagnostics.seen("dropped messages")
+        self.report(WARN, self._overload)
 
     def _advance(self) -> None:
         for prediction in self._predictor.advance():

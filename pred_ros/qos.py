@@ -1,21 +1,32 @@
-"""Every quality-of-service profile in one place. Reliable writers serve reliable and best-effort readers alike."""
+"""Every quality-of-service profile in one place. Reliable writers serve reliable and best-effort readers alike.
+
+Live readers of points keep the newest few. A scored replay must lose nothing, however slow its reader: with
+`overload: queue` the predictor reads the complete profile, as the evaluator does. Writers are complete, because a
+writer that keeps fewer messages than a reader asks for loses them; their memory follows what is not yet taken.
+"""
 
 from __future__ import annotations
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 LIVE_DEPTH = 5
+LIVE_POSES = 50  # 0.1 s at 500 Hz: small, and every one of them moves the simulation
 # Deep enough for the longest backlog of a scored replay (20 s at 500 Hz); memory follows what is queued.
 COMPLETE_DEPTH = 10_000
 
 
 def points_live() -> QoSProfile:
-    """Readers that want the newest points: RVIZ, a planner. A slow one loses the oldest."""
+    """Readers that want the newest points: the predictor with `overload: newest`. A slow one loses the oldest."""
     return _profile(LIVE_DEPTH, DurabilityPolicy.VOLATILE)
 
 
+def poses_live() -> QoSProfile:
+    """Live readers of poses and flags: deeper than of points, but never seconds behind them."""
+    return _profile(LIVE_POSES, DurabilityPolicy.VOLATILE)
+
+
 def points_complete() -> QoSProfile:
-    """Writers of points and poses, and readers that must not lose one (predictor, evaluator)."""
+    """Writers of points and poses, and readers that must not lose one (a queueing predictor, the evaluator)."""
     return _profile(COMPLETE_DEPTH, DurabilityPolicy.VOLATILE)
 
 

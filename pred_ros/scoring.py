@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,34 +13,44 @@ from pred_core.bag.clouds import PointFrame
 from pred_core.errors import InputError
 from pred_core.metrics.correspondence import coordinate_l1, mde
 from pred_core.types import Array
+from pred_ros.laps import Laps, Time
 from pred_ros.marks import EpisodeMark
 
-LAP = 1_000_000_000  # [ns] a jump back by more is a loop; by less, the message is late
+LATE = 1.0  # [s] a jump back by more is a loop; by less, the message is late
+MOST_FRAMES = 100_000  # measured frames kept; beyond it the oldest episode is released (a replay in a loop)
 FIRST_PREDICTED = 2  # frames 0 and 1 are the start of every prediction
-Time = tuple[int, int]  # (lap, stamp [ns])
 T = TypeVar("T")
 
 
 @dataclass
 class Series(Generic[T]):
-    """Values in the order of their stamps, one topic."""
+    """Values in the order of their stamps, one topic. `laps` is shared by the topics that are compared."""
 
     topic: str
+    laps: Laps[T]
     times: list[Time] = field(default_factory=list)
     values: list[T] = field(default_factory=list)
+    total: int = 0  # values that came, also those forgotten since
 
-    def append(self, stamp: int, value: T) -> Time:
-        """Add a value. Raises: InputError if its stamp is not after the last one (a loop begins a new lap)."""
-        lap, newest = self.times[-1] if self.times else (0, -(2**62))
-        if stamp <= newest:
-            if newest - stamp < LAP:
-                raise InputError(
-                    f"{self.topic}: time runs backwards", got=f"stamp {stamp * 1e-9:.6f} s after {newest * 1e-9:.6f} s"
-                )
-            lap += 1
-        self.times.append((lap, stamp))
-        self.values.append(value)
-        return self.times[-1]
+    def append(self, stamp: int, value: T) -> list[tuple[Time, T]]:
+        """Add a value, after the one it confirms if there is one; returns what was added.
+
+        Raises: InputError for a stamp that is late or far ahead (laps.py).
+        """
+        added = self.laps.take(self.topic, stamp, value)
+        for time, item in added:
+            while self.times and self.times[-1] >= time:  # their stamps were out of line
+                self.times.pop()
+                self.values.pop()
+            self.times.append(time)
+            self.values.append(item)
+        self.total += len(added)
+        return added
+
+    def forget(self, before: Time) -> None:
+        """Drop the values before `before`."""
+        count = bisect_left(self.times, before)
+        del self.times[:count], self.values[:count]
 
     def at(self, time: Time, tolerance: int) -> T | None:
         """The value nearest to `time` within `tolerance` [ns], or None."""
@@ -69,7 +79,7 @@ class Scored:
     @property
     def scorable(self) -> NDArray[np.bool_]:
         """(T,) frames that have a prediction."""
-        return np.asarray(np.isfinite(self.predicted).all(axis=(1, 2)))
+        return np.asarray(np.isfinite(self.predicted).all(axis=(1, 2))) & bool(len(self.id))
 
     @property
     def lost(self) -> int:
@@ -80,32 +90,42 @@ class Scored:
 class Scorer:
     """Feed it marks, points and predictions in any order across topics; ask for running or final scores."""
 
-    def __init__(self, tolerance: float):
-        """`tolerance` [s]: how far apart the stamps of a pair may be."""
+    def __init__(self, tolerance: float, most_frames: int = MOST_FRAMES):
+        """`tolerance` [s]: how far apart the stamps of a pair may be; `most_frames`: measured frames kept."""
         self._tolerance = round(tolerance * 1e9)
-        self.points: Series[PointFrame] = Series("tracker/points")
-        self.predictions: Series[tuple[NDArray[np.uint32], Array]] = Series("prediction/points")
+        self._most_frames = most_frames
+        laps: Laps[Any] = Laps(LATE)
+        self.points: Series[PointFrame] = Series("tracker/points", laps)
+        self.predictions: Series[tuple[NDArray[np.uint32], Array]] = Series("prediction/points", laps)
         self.marks: list[EpisodeMark] = []
+        self.announced = 0  # episodes
+        self.released = 0  # episodes that the final score does not cover any more
+        self._promised = self._to_predict = 0  # frames
         self.pairs = 0
         self._sum_mde = self._sum_l1 = 0.0
 
     def add_mark(self, mark: EpisodeMark) -> None:
         """An episode begins."""
         self.marks.append(mark)
+        self.announced += 1
+        self._promised += mark.frames
+        self._to_predict += max(0, mark.frames - FIRST_PREDICTED)
 
     def add_points(self, frame: PointFrame) -> None:
-        """A measured frame. Raises: InputError if time runs backwards."""
-        time = self.points.append(frame.stamp, frame)
-        found = self.predictions.at(time, self._tolerance)
-        if found is not None:
-            self._pair(found, frame)
+        """A measured frame. Raises: InputError for its stamp (laps.py)."""
+        for time, measured in self.points.append(frame.stamp, frame):
+            found = self.predictions.at(time, self._tolerance)
+            if found is not None:
+                self._pair(found, measured)
+        if len(self.points.times) > self._most_frames:
+            self._release()
 
     def add_prediction(self, stamp: int, ids: NDArray[np.uint32], position: Array) -> None:
-        """A predicted frame, position (N, 3) [m]. Raises: InputError if time runs backwards."""
-        time = self.predictions.append(stamp, (ids, position))
-        frame = self.points.at(time, self._tolerance)
-        if frame is not None:
-            self._pair((ids, position), frame)
+        """A predicted frame, position (N, 3) [m]. Raises: InputError for its stamp (laps.py)."""
+        for time, prediction in self.predictions.append(stamp, (ids, position)):
+            frame = self.points.at(time, self._tolerance)
+            if frame is not None:
+                self._pair(prediction, frame)
 
     @property
     def running(self) -> tuple[float, float]:
@@ -114,9 +134,8 @@ class Scorer:
 
     def complete(self) -> bool:
         """True when every announced frame, and its prediction, has arrived."""
-        promised = sum(m.frames for m in self.marks)
-        predicted = sum(max(0, m.frames - FIRST_PREDICTED) for m in self.marks)
-        return bool(self.marks) and len(self.points.times) >= promised and len(self.predictions.times) >= predicted
+        arrived = self.points.total >= self._promised and self.predictions.total >= self._to_predict
+        return self.announced > 0 and arrived
 
     def episodes(self) -> list[Scored]:
         """What was seen, cut at the marks; without marks, one episode of everything.
@@ -130,6 +149,19 @@ class Scorer:
             marks = [EpisodeMark("live", 0, 1, self.points.times[0][1], len(self.points.times))]
         ends = [m.begin for m in marks[1:]] + [2**62]
         return [self._cut(mark, end) for mark, end in zip(marks, ends, strict=True)]
+
+    def _release(self) -> None:
+        """Forget the oldest episode; without a later mark, the oldest tenth of the frames."""
+        self.marks.sort(key=lambda m: m.begin)
+        until = self.points.times[max(1, len(self.points.times) // 10)]
+        if len(self.marks) > 1:
+            begin = self.marks[1].begin
+            until = next((t for t in self.points.times if t[1] >= begin), until)
+            self.marks.pop(0)
+            self.released += 1
+        slack = (until[0], until[1] - self._tolerance)
+        self.points.forget(until)
+        self.predictions.forget(slack)
 
     def _cut(self, mark: EpisodeMark, end: int) -> Scored:
         inside = [k for k, (_, stamp) in enumerate(self.points.times) if mark.begin <= stamp < end]

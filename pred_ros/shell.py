@@ -1,6 +1,7 @@
 """What every node shares: parameters, lifecycle with autostart, diagnostics, signals, exit code.
 
-A node is a subclass of `Shell` with three methods (`setup`, `start`, `stop`); its `main` is `run(TheNode)`.
+A node is a subclass of `Shell` with three methods (`setup`, `start`, `stop`); its `main` is `run(TheNode)`. What they
+make is destroyed by the shell at cleanup and shutdown.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn, Protocol, cast
 
 import rclpy
@@ -16,7 +18,11 @@ from rclpy.exceptions import InvalidParameterTypeException, ParameterUninitializ
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
 from pred_core.errors import PredError
 from pred_ros import parameters
@@ -33,6 +39,16 @@ class NodeConfig(Protocol):
     @property
     def autostart(self) -> bool:
         """Configure and activate without waiting for a lifecycle manager."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a node has made so far."""
+
+    publishers: set[Publisher]
+    services: set[Service]
+    subscriptions: set[Subscription]
+    timers: set[Timer]
 
 
 class Shell(LifecycleNode):
@@ -54,6 +70,7 @@ class Shell(LifecycleNode):
         self.diagnostics = Diagnostics(self.get_fully_qualified_name())
         self._diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._timer = self.create_timer(1.0, self._heartbeat)
+        self._own = self._made()  # outlives a cleanup
 
     def setup(self) -> None:
         """Build the core object and the publishers. May raise PredError."""
@@ -109,6 +126,30 @@ class Shell(LifecycleNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Lifecycle: pause."""
         return self._attempt(self.stop)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Lifecycle: back to what it was before `setup`."""
+        return self._attempt(self._release)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Lifecycle: end the work, from whatever state; the process ends by a signal."""
+        return self._attempt(self._release)
+
+    def _release(self) -> None:
+        """Stop, then destroy what `setup` and `start` made."""
+        self.stop()
+        made = self._made()
+        for publisher in made.publishers - self._own.publishers:
+            self.destroy_publisher(publisher)
+        for service in made.services - self._own.services:
+            self.destroy_service(service)
+        for subscription in made.subscriptions - self._own.subscriptions:
+            self.destroy_subscription(subscription)
+        for timer in made.timers - self._own.timers:
+            self.destroy_timer(timer)
+
+    def _made(self) -> Made:
+        return Made(set(self.publishers), set(self.services), set(self.subscriptions), set(self.timers))
 
     def _attempt(self, action: Any) -> TransitionCallbackReturn:
         try:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +24,15 @@ from ros_bench import COUNT, START, STEP, Bench, bench_of, make_twin, own_domain
 from std_msgs.msg import String
 
 from pred_core.config import load_yaml
+from pred_core.twin import Extension, ResidualWeights, Twin
 from pred_core.types import State
 from pred_ros import bringup, convert, marks, qos, shell
+from pred_ros.arm_node import ArmNode
 from pred_ros.evaluator_node import EvaluatorNode
+from pred_ros.live_report import stage_name
 from pred_ros.player_node import PlayerNode
 from pred_ros.predictor_node import PredictorNode
+from pred_ros.processes import Children
 
 ROOT = Path(__file__).parents[1]
 ERROR = DiagnosticStatus.ERROR
@@ -215,7 +222,7 @@ def test_descriptors_carry_unit_and_range(bench: Bench) -> None:
 
 @pytest.mark.parametrize("file", sorted((ROOT / "config" / "nodes").glob("*.yaml")), ids=lambda p: p.name)
 def test_shipped_parameter_files_fit_the_nodes(file: Path) -> None:
-    classes = {c.NAME: c.CONFIG for c in (PlayerNode, PredictorNode, EvaluatorNode)}
+    classes = {c.NAME: c.CONFIG for c in (PlayerNode, PredictorNode, EvaluatorNode, ArmNode)}
     from pred_core.config import from_mapping
 
     for name, parameters in bringup.read_nodes(file).items():
@@ -232,6 +239,45 @@ def test_bringup_refuses_unknown_nodes_and_malformed_overrides(tmp_path: Path) -
     with pytest.raises(ValueError, match="NODE.PARAMETER=VALUE"):
         bringup.read_nodes(file, ["player.bag=y"])
     assert bringup.read_nodes(file, ["predictor.horizon=0.5"])["predictor"] == {"twin": "x", "horizon": 0.5}
+
+
+@pytest.mark.parametrize("codes", [(3,), (0, 3), (3, 0)], ids=str)
+def test_bringup_returns_the_code_of_a_node_that_failed(
+    codes: tuple[int, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    def ends(node: str, parameters: dict) -> list[str]:
+        return [sys.executable, "-c", f"import sys; print('why'); sys.exit({parameters['code']})"]
+
+    monkeypatch.setattr(bringup, "node_command", ends)
+    # No call of poll before all have ended: what the last one says must be seen all the same.
+    start = Children.start
+    monkeypatch.setattr(Children, "start", lambda *args: start(*args).wait())
+    with kept_signals():
+        assert bringup.run({f"n{k}": {"code": code} for k, code in enumerate(codes)}, None, tmp_path) == 3
+    assert f"n{codes.index(3)} ended: why" in capsys.readouterr().err
+
+
+def test_bringup_returns_0_when_all_end_well(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(bringup, "node_command", lambda node, _: [sys.executable, "-c", "pass"])
+    with kept_signals():
+        assert bringup.run({"a": {}, "b": {}}, None, tmp_path) == 0
+
+
+@contextmanager
+def kept_signals() -> Iterator[None]:
+    """Bringup takes the signals of its process; a test gives them back."""
+    before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_the_model_is_named_after_the_stage_of_its_twin(tmp_path: Path) -> None:
+    twin = Twin.load(make_twin(tmp_path / "twin"))
+    assert stage_name(twin) == "spring-mass"
+    extended = twin.replace(extensions=(Extension("drag-linear", 1, {"coefficient": (0.1,)}),))
+    assert stage_name(extended) == "extended"
+    assert stage_name(extended.replace(residual=ResidualWeights({}, {"w": torch.zeros(1)}))) == "pred"
 
 
 def test_nothing_of_a_test_stays_initialised() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from geometry_msgs.msg import PoseArray
+from rclpy.duration import Duration
 from ros_bench import Bench, bench_of, points, pose
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String, UInt8MultiArray
@@ -24,7 +26,7 @@ from pred_core.bag.grippers import make_gripper_closed, make_gripper_pose
 from pred_core.bag.wire import stamp_of
 from pred_core.bag.writer import BagWriter
 from pred_ros import convert, marks, qos
-from pred_ros.player_node import PlayerNode
+from pred_ros.player_node import PlayerNode, unacknowledged
 from pred_ros.playlist import find_clips, stream
 
 SAMPLE = Path(__file__).parents[1] / "bags" / "sample_cable"
@@ -145,3 +147,35 @@ def test_flags_come_before_the_poses_they_hold_for(tmp_path: Path) -> None:
     assert order == ["gripper/closed", "gripper/pose", "tracker/points"] * 5
 
 
+class Deaf:
+    """A publisher whose reader never acknowledges."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def wait_for_all_acked(self, timeout: Duration) -> bool:
+        """As long as it is told, in vain."""
+        self.asked += 1
+        time.sleep(timeout.nanoseconds * 1e-9)
+        return False
+
+
+def test_the_wait_for_readers_at_the_end_is_halted_at_once() -> None:
+    outs = {"tracker/points": Deaf(), "gripper/pose": Deaf()}
+    halted = threading.Event()
+    threading.Timer(0.3, halted.set).start()
+    begin = time.monotonic()
+    assert unacknowledged(outs, 20.0, halted.is_set) == list(outs)
+    assert time.monotonic() - begin < 1.0
+
+
+def test_the_wait_for_readers_at_the_end_is_limited_for_all_together() -> None:
+    class Heard(Deaf):
+        def wait_for_all_acked(self, timeout: Duration) -> bool:
+            return True
+
+    begin = time.monotonic()
+    outs = {"a": Heard(), "b": Deaf(), "c": Deaf()}
+    assert unacknowledged(outs, 0.3, lambda: False) == ["b", "c"]
+    assert time.monotonic() - begin < 1.0
+    assert unacknowledged({"a": Heard()}, 0.3, lambda: False) == []

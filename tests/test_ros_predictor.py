@@ -45,7 +45,7 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def bench(twin: Path) -> Iterator[Bench]:
-    with bench_of(StraightPredictor, {"twin": str(twin), "held": "'0:0'"}) as made:
+    with bench_of(StraightPredictor, {"twin": str(twin), "held": "'0:0'", "overload": "queue"}) as made:
         yield made
 
 
@@ -62,7 +62,7 @@ def test_prediction_carries_the_stamp_of_the_pose_and_the_hand_worked_place(benc
 
 
 def test_horizon_stands_in_the_stamp(twin: Path) -> None:
-    parameters = {"twin": str(twin), "held": "'0:0'", "horizon": "0.05"}
+    parameters = {"twin": str(twin), "held": "'0:0'", "horizon": "0.05", "overload": "queue"}
     with bench_of(StraightPredictor, parameters) as bench:
         for frame in range(5):
             bench.feed(frame)
@@ -83,7 +83,7 @@ def test_correction_follows_the_tracks_and_open_loop_does_not(twin: Path) -> Non
 
     heights = {}
     for mode in ("none", "tracks"):
-        with bench_of(StraightPredictor, {"twin": str(twin), "correct": mode}) as bench:
+        with bench_of(StraightPredictor, {"twin": str(twin), "correct": mode, "overload": "queue"}) as bench:
             for frame in range(12):
                 bench.points_out.publish(convert.points_to_cloud(moved(frame)))
             bench.until(lambda: bench.node.diagnostics.counter("messages on tracker/points") == 12, "points")  # noqa: B023
@@ -198,7 +198,7 @@ def test_hidden_particle_is_named_while_no_start_is_possible(bench: Bench) -> No
 
 
 def test_divergence_stops_before_the_wire_and_reset_starts_anew(twin: Path) -> None:
-    parameters = {"twin": str(twin), "held": "'0:0'"}
+    parameters = {"twin": str(twin), "held": "'0:0'", "overload": "queue"}
     with bench_of(DivergingPredictor, parameters) as bench:
         for frame in range(10):
             bench.feed(frame)
@@ -237,7 +237,7 @@ def test_twin_of_another_rate_is_said(tmp_path: Path, twin: Path) -> None:
         MAKE_DYNAMICS = staticmethod(lambda _: Slow())
 
     assert Twin.load(twin).body.count == COUNT
-    with bench_of(SlowPredictor, {"twin": str(twin)}) as bench:
+    with bench_of(SlowPredictor, {"twin": str(twin), "overload": "queue"}) as bench:
         frame = itertools.count()
 
         def feed() -> bool:
@@ -258,15 +258,29 @@ def test_too_slow_drops_to_the_newest_data_and_says_so(twin: Path) -> None:
 
     parameters = {"twin": str(twin), "held": "'0:0'", "overload": "newest", "max_backlog": "0.1"}
     with bench_of(SlowPredictor, parameters) as bench:
-        for frame in range(100):
-            bench.feed(frame)
+        def feed(frames: range) -> None:
+            """A live reader keeps the newest few clouds: take each one before the next is sent."""
+            for frame in frames:
+                bench.feed(frame)
+                count = bench.node.diagnostics.counter("messages on tracker/points") + 1
+                bench.until(
+                    lambda n=count: bench.node.diagnostics.counter("messages on tracker/points") >= n, "the cloud"
+                )
+
+        feed(range(100))
         bench.until(lambda: bench.says(WARN, "too slow", "messages dropped"), "a warning")
         assert bench.node.diagnostics.counter("dropped messages") > 0
-        for frame in range(200, 206):
-            bench.feed(frame)
+        feed(range(200, 206))
         newest = START + 205 * STEP
         bench.until(lambda: bench.predictions and bench.predictions[-1][0] == newest, "the newest data are predicted")
         assert bench.predictions[-1][1].position[4, 0] == pytest.approx(0.2 + 0.005 * 205, abs=1e-5)
+        bench.node.heartbeat()
+        assert bench.node.diagnostics.level == WARN, "it predicts again, and still says that messages were dropped"
+        assert "too slow" in bench.node.diagnostics.message
+        clock = time.monotonic() + 6.0
+        bench.node.diagnostics._clock = lambda: clock
+        bench.node.heartbeat()
+        assert "too slow" not in bench.node.diagnostics.message, "six seconds later it does not"
 
 
 def test_queue_keeps_every_message_however_slow(twin: Path) -> None:
@@ -284,3 +298,58 @@ def test_queue_keeps_every_message_however_slow(twin: Path) -> None:
             bench.feed(frame)
         bench.until(lambda: len(bench.predictions) == 58, "all of them")
         assert bench.node.diagnostics.counter("dropped messages") == 0
+
+
+def test_a_cloud_without_points_does_not_end_the_node(bench: Bench) -> None:
+    for frame in range(4):
+        bench.feed(frame)
+    bench.until(lambda: len(bench.predictions) == 2, "predictions for frames 2 and 3")
+    bench.points_out.publish(convert.points_to_cloud(points(4, ids=0)))
+    bench.pose_out.publish(convert.pose_to_message(pose(4)))
+    bench.feed(5)
+    bench.until(lambda: len(bench.predictions) == 4, "predictions go on")
+    assert bench.node.exit_code is None
+
+
+def test_cleanup_leaves_nothing_and_the_node_can_be_configured_again(bench: Bench) -> None:
+    node = bench.node
+
+    def made() -> list[int]:
+        return [len(list(x)) for x in (node.publishers, node.services, node.subscriptions, node.timers)]
+
+    bench.until(lambda: node._inputs, "the node listens")
+    before = made()
+    for _ in range(2):
+        node.trigger_deactivate()
+        node.trigger_cleanup()
+        idle = made()
+        assert all(a < b for a, b in zip(idle, before, strict=True)), "each kind is gone"
+        node.trigger_configure()
+        node.trigger_activate()
+        bench.until(lambda: node._inputs, "the node listens again")
+        assert made() == before, "nothing is doubled"
+    bench.until(lambda: bench.points_out.get_subscription_count() == 1, "one reader")
+    for frame in range(5):
+        bench.feed(frame)
+    bench.until(lambda: len(bench.predictions) == 3, "it predicts")
+    node.trigger_shutdown()
+    assert node._worker is None and made() == idle, "shutdown from active ends the work"
+
+
+def test_a_worker_within_a_long_horizon_ends_at_once(twin: Path) -> None:
+    class Slow(Straight):
+        def step(self, state: State, grip: Grip) -> State:
+            time.sleep(0.02)
+            return super().step(state, grip)
+
+    class SlowPredictor(PredictorNode):
+        MAKE_DYNAMICS = staticmethod(lambda _: Slow())
+
+    parameters = {"twin": str(twin), "held": "'0:0'", "horizon": "5.0", "overload": "queue"}
+    with bench_of(SlowPredictor, parameters) as bench:
+        for frame in range(10):
+            bench.feed(frame)
+        bench.until(lambda: bench.node._predictor.counts.steps > 0, "it steps; 500 steps of 20 ms follow")
+        begin = time.monotonic()
+        bench.node.stop()
+        assert time.monotonic() - begin < 1.0  # not the 10 s of the horizon

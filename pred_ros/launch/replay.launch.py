@@ -22,7 +22,7 @@ def generate_launch_description() -> LaunchDescription:
 
     factor = ParameterValue(LaunchConfiguration("factor"), value_type=float)
     own = {
-        "evaluator": {"out": text("out")},
+        "evaluator": {"out": text("out"), "twin": text("twin")},
         "predictor": {"twin": text("twin"), "held": text("held")},
         "player": {"bag": text("bag"), "split": text("split"), "factor": factor},
     }
