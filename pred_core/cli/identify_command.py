@@ -14,7 +14,7 @@ from typing import Any, get_type_hints
 from pred_core.bag.dataset import load_dataset
 from pred_core.config import from_mapping
 from pred_core.identify.config import PAPER, IdentifyConfig
-from pred_core.identify.report import flags, write_report
+from pred_core.identify.report import DEFINITIONS, flags, write_report
 from pred_core.identify.run import identify, train_episodes
 from pred_core.identify.space import search_space
 from pred_core.twin import Twin
@@ -45,7 +45,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Identify, write the twin, `identify.json` and `identify.html`. Interrupted and run again, it goes on."""
+    """Identify, write the twin, `identify.json` and `identify.html`.
+
+    Interrupted and run again, the search goes on where it stopped; the refinement starts again.
+    """
     config = _config(args)
     _check_names(config)
     dataset = load_dataset(args.dataset)
@@ -53,20 +56,22 @@ def run(args: argparse.Namespace) -> int:
     show = _Progress()
     journal = args.out / JOURNAL
     if journal.is_file():
-        show(f"resuming: going on with the search in {journal}")
+        show(f"resuming: going on with the search in {journal}; the refinement starts again")
     command = shlex.join(["pred", "identify", str(args.dataset), "--out", str(args.out), *_given(args)])
     result = identify(dataset, train_episodes(dataset), config, journal, show, command)
     show.end()
     result.twin.replace(base=base).save(args.out)
-    journal.unlink()
-    summary = result.summary()
+    summary = {**result.summary(), "definitions": DEFINITIONS}
     (args.out / "identify.json").write_text(json.dumps(summary, indent=1), encoding="utf-8")
     write_report(args.out / "identify.html", result, command)
+    journal.unlink()  # last: until everything is written, the search can be gone on with
     for name, entry in result.values.items():
         said = flags(entry)
         print(f"{name:32} {entry['value']:.5g} {entry['unit']}{f'  ({said})' if said else ''}")
-    check = "" if result.held_out_mm is None else f"; {result.held_out_mm:.2f} mm on recordings held out"
-    print(f"mean error per coordinate of free particles: {result.fitted_mm:.2f} mm on the best 90 % of episodes{check}")
+    print("mean error per coordinate of free particles, best 90 % of windows:")
+    print(f"  {result.fitted_mm:.2f} mm on all train recordings, which it was fitted on")
+    if result.held_out_mm is not None:
+        print(f"  {result.held_out_mm:.2f} mm on recordings held out, before the last refit on all of them")
     if result.left_out:
         print(f"left out as outliers, look for damaged tracks: {', '.join(result.left_out)}")
     print(f"wrote {args.out} and {args.out / 'identify.html'} in {result.seconds:.0f} s")

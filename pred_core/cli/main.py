@@ -13,6 +13,12 @@ from pred_core.errors import PredError, nearest
 COMMANDS: tuple[str, ...] = ("info", "convert", "identify", "train", "evaluate", "plant")
 INTERRUPTED = 130  # the shell's code for SIGINT
 BAD_INPUT = 2
+_INTERRUPTED = "run the same command again to go on where it stopped"
+_INTERRUPTED_IN = {
+    "identify": "run the same command again: the search goes on where it stopped, the refinement starts again",
+    "train": "run the same command again with --resume to go on from the last checkpoint",
+    "info": "nothing was changed",
+}  # commands that do not go on exactly where they stopped
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -29,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"pred: {error}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
-        print("pred: interrupted; run the same command again to go on where it stopped", file=sys.stderr)
+        print(f"pred: interrupted; {_INTERRUPTED_IN.get(name or '', _INTERRUPTED)}", file=sys.stderr)
         return INTERRUPTED
 
 

@@ -14,6 +14,14 @@ from pred_core.report.page import number
 
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#8c959f"  # colour-blind safe (Okabe and Ito)
 
+DEFINITIONS = {
+    "error_mm": "mean absolute error per coordinate of free particles, open loop over whole episodes [mm]",
+    "error_mm.fitted": "mean over the best 90 % of windows of all train recordings, after the last refit on them",
+    "error_mm.held_out": "mean over the best 90 % of windows of recordings held out, before the last refit on all "
+    "recordings: not of the parameters that are stored; null: nothing was held out",
+    "error_mm.episodes": "every train episode, after the last refit",
+}  # of the keys in `identify.json`
+
 
 def write_report(path: Path, result: Identified, command: str) -> None:
     """Parameters with spread and sensitivity, restarts, and the error of every episode."""
@@ -21,11 +29,14 @@ def write_report(path: Path, result: Identified, command: str) -> None:
     page.code(command)
     check = ""
     if result.held_out_mm is not None:
-        check = f", {number(result.held_out_mm)} mm on recordings that were not fitted"
+        check = (
+            f" {number(result.held_out_mm)} mm on recordings held out, also the best 90 %, by the parameters before "
+            "the last refit: the values below were then refitted on all recordings, for which nothing is held out."
+        )
     page.text(
-        f"Mean error per coordinate of free particles, open loop over whole episodes: {number(result.fitted_mm)} mm on "
-        f"the best 90 % of the train episodes{check}. Track noise {number(result.noise_mm)} mm. Seed {result.seed}, "
-        f"{result.seconds:.0f} s."
+        "Mean error per coordinate of free particles, open loop over whole episodes: "
+        f"{number(result.fitted_mm)} mm on the best 90 % of the train episodes, which the parameters were fitted on."
+        f"{check} Track noise {number(result.noise_mm)} mm. Seed {result.seed}, {result.seconds:.0f} s."
     )
     page.heading("Parameters")
     header = ("parameter", "value", "unit", "95 % interval", "spread over restarts", "loss at 10 % change", "")
