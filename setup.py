@@ -30,7 +30,7 @@ EXTRAS = {
     "ros": ["ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"],
     "vision": ["open3d", "opencv-python-headless<5"],
     "plant": ["mujoco==4.0.0"],
-    "hardware": ["ur-rtde", "depthai"],
+    "hardware": ["ur-rtde", "xarm-python-sdk", "depthai"],
     "dev": ["hypothesis", "mypy", "pytest", "ruff"],
 }
 

@@ -147,6 +147,17 @@ def test_ur_starts_its_script_again_or_says_so() -> None:
             case.arm.begin()
             case.arm.command(at(HOME))
         case.control.answers[call] = lambda *a: True
+
+    def broken(*args: Any) -> bool:
+        raise RuntimeError("socket closed")
+
+    for call in ("servoL", "kickWatchdog", "isProgramRunning", "servoStop", "stopScript"):
+        case = UrCase()
+        case.control.answers[call] = broken
+        with pytest.raises(InputError, match="ur: the driver failed; got socket closed"):
+            case.arm.begin()
+            case.arm.command(at(HOME))
+            case.arm.close()
     with pytest.raises(InputError, match="connection lost"):
         UrCase(isConnected=lambda: False).arm.read()
     with pytest.raises(InputError, match="reports no pose"):
@@ -170,8 +181,7 @@ class XArmCase:
                 "get_servo_angle": lambda is_radian: (0, [0.1] * 7),
                 "disconnect": lambda: None,
                 "connected": True,
-                "error_code": 0,
-                "state": 2,
+                "get_err_warn_code": lambda: (0, [0, 0]),
                 "version_number": (2, 3, 0),
                 **changes,
             }
@@ -211,11 +221,15 @@ def test_xarm_holds_its_own_speed_limit() -> None:
 def test_xarm_never_clears_an_error() -> None:
     case = XArmCase()
     case.arm.begin()
-    case.api.answers["error_code"] = 31
-    with pytest.raises(InputError, match="error 31"):
+    case.api.answers["get_err_warn_code"] = lambda: (0, [31, 0])
+    case.api.answers["vc_set_cartesian_velocity"] = lambda *a, **k: 1  # what the SDK makes of an error
+    assert not case.arm.read().ready and case.arm.read().message == "error 31"
+    with pytest.raises(InputError, match="vc_set_cartesian_velocity was refused; got code 1"):
         case.arm.command(at(HOME))
-    case.arm.stop()
-    with pytest.raises(InputError, match="xarm: error 31"):
+    with pytest.raises(InputError, match="refused"):
+        case.arm.stop()
+    assert case.api.last("set_state") == (4,)  # halted all the same
+    with pytest.raises(InputError, match="xarm: error 31. Clear it in Studio"):
         case.arm.begin()
     assert not {"clean_error", "clean_warn"} & set(case.api.names())
 

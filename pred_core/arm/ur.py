@@ -6,6 +6,8 @@ more. A protective stop is never released from here; a person does that at the p
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 import numpy as np
@@ -63,13 +65,15 @@ class UrArm:
         """Pose, joints and safety state from the receive interface. Raises: InputError without connection."""
         if not self._receive.isConnected():
             raise InputError("ur: connection lost", next_step="Check cable and controller, then start the node again")
-        pose = np.array(self._receive.getActualTCPPose(), float)
+        with _one_line():
+            pose = np.array(self._receive.getActualTCPPose(), float)
+            angles = [float(q) for q in self._receive.getActualQ()]
         if pose.shape != (6,) or not np.isfinite(pose).all():
             raise InputError("ur: the controller reports no pose", got=pose.tolist())
         position, rotation = self._placement.to_world(
             pose[:3], from_rotation_vector((float(pose[3]), float(pose[4]), float(pose[5])))
         )
-        joints = dict(zip(JOINTS, (float(q) for q in self._receive.getActualQ()), strict=True))
+        joints = dict(zip(JOINTS, angles, strict=True))
         trouble = self._trouble()
         return Reading(position, rotation, not trouble, trouble or "running", None, joints)
 
@@ -78,10 +82,11 @@ class UrArm:
         reading = self.read()
         if not reading.ready:
             raise InputError(f"ur: {reading.message}", next_step="Clear it at the pendant, then enable again")
-        if not self._control.isProgramRunning() and not self._control.reuploadScript():
-            raise InputError("ur: the control script does not run", next_step="Set the pendant to remote control")
-        if not self._control.setWatchdog(WATCHDOG):
-            raise InputError("ur: the controller took no watchdog", next_step="Start the node again")
+        with _one_line():
+            if not self._control.isProgramRunning() and not self._control.reuploadScript():
+                raise InputError("ur: the control script does not run", next_step="Set the pendant to remote control")
+            if not self._control.setWatchdog(WATCHDOG):
+                raise InputError("ur: the controller took no watchdog", next_step="Start the node again")
         self._check.restart(reading.position, reading.rotation)
         self._following = True
 
@@ -95,25 +100,30 @@ class UrArm:
         self._check.check(setpoint, "ur")
         position, rotation = self._placement.to_base(setpoint.position, setpoint.rotation)
         pose = [*position.tolist(), *rotation_vector(rotation)]
-        # Order: pose, speed and acceleration (both ignored by the controller), time, lookahead, gain.
-        if not self._control.servoL(pose, 0.0, 0.0, self._period, LOOKAHEAD, GAIN):
-            raise InputError("ur: servoL was refused", next_step="Look at the pendant's log")
-        if not self._control.kickWatchdog():
-            raise InputError("ur: the watchdog could not be kicked")
+        with _one_line():
+            # Order: pose, speed and acceleration (both ignored by the controller), time, lookahead, gain.
+            if not self._control.servoL(pose, 0.0, 0.0, self._period, LOOKAHEAD, GAIN):
+                raise InputError("ur: servoL was refused", next_step="Look at the pendant's log")
+            if not self._control.kickWatchdog():
+                raise InputError("ur: the watchdog could not be kicked")
 
     def stop(self) -> None:
         """servoStop, which decelerates on the controller."""
         self._check.forget()
         if self._following:
             self._following = False
-            self._control.servoStop(DECELERATION)
+            with _one_line():
+                self._control.servoStop(DECELERATION)
 
     def close(self) -> None:
         """Stop, end the script, disconnect."""
-        self.stop()
-        self._control.stopScript()
-        self._control.disconnect()
-        self._receive.disconnect()
+        try:
+            self.stop()
+        finally:
+            with _one_line():
+                self._control.stopScript()
+                self._control.disconnect()
+                self._receive.disconnect()
 
     def _trouble(self) -> str:
         """Why the arm would not move, '' if it would."""
@@ -137,3 +147,12 @@ def connect_ur(host: str, placement: Placement, period: float, check: StepCheck)
         return UrArm(RTDEControlInterface(host), receive, placement, period, check)
     except RuntimeError as error:
         raise InputError(f"ur: no controller at {host}", got=error, next_step="Check address and network") from error
+
+
+@contextmanager
+def _one_line() -> Iterator[None]:
+    """The driver's own errors (a lost connection, a script that ended), as one line."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise InputError("ur: the driver failed", got=error, next_step="Look at the pendant's log") from error

@@ -38,17 +38,16 @@ class XArmApi(Protocol):
     """What is used of `xarm.wrapper.XArmAPI`. Every call returns a code, 0 is good, or (code, values)."""
 
     connected: bool
-    error_code: int
-    state: int
     version_number: tuple[int, int, int]
 
+    def get_err_warn_code(self) -> tuple[int, list[float]]: ...
     def get_position(self, is_radian: bool) -> tuple[int, list[float]]: ...
     def get_servo_angle(self, is_radian: bool) -> tuple[int, list[float]]: ...
     def motion_enable(self, enable: bool) -> int: ...
     def set_mode(self, mode: int) -> int: ...
     def set_state(self, state: int) -> int: ...
     def set_reduced_tcp_boundary(self, boundary: list[int]) -> int: ...
-    def set_fence_mode(self, on: bool) -> int: ...
+    def set_fence_mode(self, on: bool) -> int | list[int]: ...
     def vc_set_cartesian_velocity(
         self, speeds: list[float], is_radian: bool, is_tool_coord: bool, duration: float
     ) -> int: ...
@@ -62,17 +61,23 @@ class XArm:
         self._api, self._placement, self._bounds = api, placement, bounds
         self._speed, self._angular_speed = HEADROOM * speed, HEADROOM * angular_speed
         self._following = False
+        self._seen: tuple[Array, Quaternion] | None = None  # measured last, world
 
     def read(self) -> Reading:
-        """Pose, joints and error state. Raises: InputError without connection or answer."""
+        """Pose, joints and error state, asked for now: the driver's own properties may be old.
+
+        Raises: InputError without connection or answer.
+        """
         if not self._api.connected:
             raise InputError("xarm: connection lost", next_step="Check cable and controller, then start the node again")
         pose = self._values("get_position", self._api.get_position(is_radian=True), 6)
         position, rotation = self._placement.to_world(pose[:3] / MM, _from_rpy(*(float(a) for a in pose[3:6])))
         angles = self._values("get_servo_angle", self._api.get_servo_angle(is_radian=True), 1)
         joints = {f"joint{k + 1}": float(a) for k, a in enumerate(angles)}
-        trouble = f"error {self._api.error_code}" if self._api.error_code else ""
-        return Reading(position, rotation, not trouble, trouble or f"state {self._api.state}", None, joints)
+        errors = self._values("get_err_warn_code", self._api.get_err_warn_code(), 1)
+        trouble = f"error {int(errors[0])}" if errors[0] else ""
+        self._seen = (position, rotation)
+        return Reading(position, rotation, not trouble, trouble or "no error", None, joints)
 
     def begin(self) -> None:
         """Fence, velocity mode, go. Raises: InputError on an error of the arm or a firmware without dead-man."""
@@ -93,13 +98,13 @@ class XArm:
         self._following = True
 
     def command(self, setpoint: SetPoint) -> None:
-        """The set-point's velocity plus a pull towards its pose, limited once more. Raises: InputError."""
-        if not self._following:
+        """The set-point's velocity plus a pull from the pose read last towards its pose, limited once more.
+
+        Raises: InputError before `begin`, or if the controller refuses it (it is in an error, or was stopped).
+        """
+        if not self._following or self._seen is None:
             raise InputError("xarm: a set-point before the arm was enabled")
-        if self._api.error_code:
-            raise InputError(f"xarm: error {self._api.error_code}", next_step="Clear it in Studio")
-        pose = self._values("get_position", self._api.get_position(is_radian=True), 6)
-        place, turned = self._placement.to_world(pose[:3] / MM, _from_rpy(*(float(a) for a in pose[3:6])))
+        place, turned = self._seen
         off = np.array(rotation_vector(multiply(setpoint.rotation, conjugate(turned))))
         linear = _limited(setpoint.velocity + GAIN * (setpoint.position - place), self._speed)
         angular = _limited(setpoint.angular_velocity + GAIN * off, self._angular_speed)
@@ -136,7 +141,8 @@ class XArm:
         low = np.floor(MM * (base.min(0) - FENCE_MARGIN)).astype(int).tolist()
         return [high[0], low[0], high[1], low[1], high[2], low[2]]
 
-    def _good(self, call: str, code: int) -> None:
+    def _good(self, call: str, answer: int | list[int]) -> None:
+        code = answer[0] if isinstance(answer, list) else answer  # some calls return the whole reply
         if code != 0:
             raise InputError(f"xarm: {call} was refused", got=f"code {code}", next_step="Look at Studio's log")
 
