@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -63,7 +64,8 @@ def read_episode(
     bag = reader.path.name
     if len(raw.points) < 2:
         raise BagError(f"{bag}: an episode needs at least 2 messages on {TRACKER_POINTS}", got=len(raw.points))
-    stamps, frames = _regular(raw.points, rate, bag)
+    stamps, source = regular_stamps(np.array([f.stamp for f in raw.points], np.int64), rate, bag)
+    frames = [None if k < 0 else raw.points[k] for k in source.tolist()]
     tracks = _tracks(stamps, frames, bag)
     grips = _grips(stamps, raw, bag)
     return Episode(
@@ -131,11 +133,13 @@ def write_episode(path: Path | str, episode: Episode) -> None:
             writer.write(GRIPPER_CLOSED, make_gripper_closed(closed[t]), stamp)
 
 
-def _regular(
-    points: list[PointFrame], rate: float | None, bag: str
-) -> tuple[NDArray[np.int64], list[PointFrame | None]]:
-    """Stamps with the lost frames filled in, and their messages (None: lost)."""
-    measured = np.array([f.stamp for f in points], np.int64)
+def regular_stamps(
+    measured: NDArray[np.int64], rate: float | None, bag: str
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Stamps (T,) [ns] with the lost frames filled in, and the message of each (T,), -1 where it was lost.
+
+    measured (M,) [ns]: stamps of the messages. Raises: BagError for a wrong rate or too long a gap.
+    """
     period = median_period(measured)
     if rate is not None and abs(period * 1e-9 * rate - 1.0) > 0.05:
         raise BagError(
@@ -144,12 +148,11 @@ def _regular(
             allowed=f"{rate:g} Hz +- 5 %",
             next_step="Correct 'rate'",
         )
-    stamps: list[int] = [int(measured[0])]
-    frames: list[PointFrame | None] = [points[0]]
-    for frame in points[1:]:
-        gap = frame.stamp - stamps[-1]
+    stamps, source = array("q", [int(measured[0])]), array("q", [0])
+    for number, stamp in enumerate(measured[1:].tolist(), start=1):
+        gap = stamp - stamps[-1]
         lost = round(gap / period) - 1
-        if lost > len(points) or (lost > 0 and gap * 1e-9 > max(LONGEST_GAP, 3e-9 * period)):
+        if lost > len(measured) or (lost > 0 and gap * 1e-9 > max(LONGEST_GAP, 3e-9 * period)):
             raise BagError(
                 f"{bag}: {TRACKER_POINTS} has a gap of {gap * 1e-9:.3g} s at {stamps[-1] * 1e-9:.3f} s",
                 allowed=f"{LONGEST_GAP:g} s, and no more frames lost than measured",
@@ -158,10 +161,20 @@ def _regular(
         begin = stamps[-1]
         for k in range(1, lost + 1):
             stamps.append(begin + round(gap * k / (lost + 1)))
-            frames.append(None)
-        stamps.append(frame.stamp)
-        frames.append(frame)
-    return np.array(stamps, np.int64), frames
+            source.append(-1)
+        stamps.append(stamp)
+        source.append(number)
+    return np.array(stamps, np.int64), np.array(source, np.int64)
+
+
+def flag_times(
+    closed_log: NDArray[np.int64], pose_log: NDArray[np.int64], pose_stamps: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Times [ns] of the closed flags on the clock of the headers.
+
+    The flags have no header. Their log times are moved by the delay between stamp and log of the poses.
+    """
+    return closed_log - round(float(np.median(pose_log - pose_stamps)))
 
 
 def _tracks(stamps: NDArray[np.int64], frames: list[PointFrame | None], bag: str) -> Tracks:
@@ -197,9 +210,7 @@ def _grips(stamps: NDArray[np.int64], raw: RawEpisode, bag: str) -> Grip:
     sizes = {len(c) for c in raw.closed}
     if sizes != {count}:
         raise BagError(f"{bag}: {GRIPPER_CLOSED} has {sorted(sizes)} flags a message", allowed=f"{count}, one a pose")
-    # The flags have no header. Their log times are moved by the delay between stamp and log of the poses.
-    delay = round(float(np.median(np.array(raw.pose_log, np.int64) - pose_stamps)))
-    flag_stamps = np.array(raw.closed_log, np.int64) - delay
+    flag_stamps = flag_times(np.array(raw.closed_log, np.int64), np.array(raw.pose_log, np.int64), pose_stamps)
     order = np.argsort(flag_stamps, kind="stable")
     closed = align_flags(stamps, flag_stamps[order], np.stack(raw.closed)[order], f"{bag}: {GRIPPER_CLOSED}")
     return Grip(

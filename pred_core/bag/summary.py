@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pred_core.bag.align import align_flags, align_poses
 from pred_core.bag.clouds import PointFrame, read_tracker_points
 from pred_core.bag.dataset import Dataset, EpisodeEntry
-from pred_core.bag.episode import check_forward, read_episode
+from pred_core.bag.episode import check_forward, flag_times, regular_stamps
 from pred_core.bag.gate import EpisodeQuality, examine_all
 from pred_core.bag.grippers import read_gripper_closed, read_gripper_pose
 from pred_core.bag.reader import BagMessage, BagReader, open_bag
@@ -110,7 +111,12 @@ class _Clock:
 
 
 def summarize_bag(path: Path | str) -> BagSummary:
-    """Read a bag once as far as it goes. Raises: BagError only if it is not a bag at all."""
+    """Read a bag once as far as it goes, one chunk in memory at a time; 16 bytes a message (its times) are kept.
+
+    `problems` is empty where `read_episode` would read the bag: every message of the required topics is checked by
+    itself, then that time runs forwards, frames have no long gap, and poses and flags cover every frame. What needs
+    dataset.yaml (rate, who is held) is checked with the data set. Raises: BagError only if it is not a bag at all.
+    """
     reader = open_bag(path)
     summary = BagSummary(
         path=str(reader.path),
@@ -187,6 +193,12 @@ class _Contract:
         self.low: NDArray[np.float64] = np.full(3, np.inf)
         self.high: NDArray[np.float64] = np.full(3, -np.inf)
         self._last: dict[str, list[int]] = {}
+        self._point_stamps = array("q")  # [ns]
+        self._pose_stamps = array("q")  # [ns]
+        self._pose_log = array("q")  # [ns]
+        self._flag_log = array("q")  # [ns]
+        self._pose_sizes: set[int] = set()
+        self._flag_sizes: set[int] = set()
 
     def add(self, message: BagMessage) -> None:
         """Check one message."""
@@ -194,13 +206,15 @@ class _Contract:
             if message.topic == TRACKER_POINTS:
                 frame = read_tracker_points(message.decode(), message.where)
                 self._forward(message, frame.stamp)
+                self._point_stamps.append(frame.stamp)
                 self._points(frame)
             elif message.topic == GRIPPER_POSE:
                 pose = read_gripper_pose(message.decode(), message.where)
                 self._forward(message, pose.stamp)
-                self.grippers = max(self.grippers, len(pose.position))
+                self._poses(message, pose.stamp, len(pose.position))
             elif message.topic == GRIPPER_CLOSED:
-                read_gripper_closed(message.decode(), message.where)
+                self._flag_sizes.add(len(read_gripper_closed(message.decode(), message.where)))
+                self._flag_log.append(message.log_time)
         except BagError as error:
             self.first.setdefault(message.topic, str(error))
             self.count[message.topic] = self.count.get(message.topic, 0) + 1
@@ -212,6 +226,35 @@ class _Contract:
             summary.hidden = 1.0 - self.visible / (self.frames * len(self.ids))
         if np.isfinite(self.low).all():
             summary.low, summary.high = self.low.tolist(), self.high.tolist()
+
+    def check_times(self, bag: str) -> None:
+        """What `read_episode` checks once all messages are there, by their times alone. Raises: BagError."""
+        points, poses, pose_log, flag_log = (
+            np.array(a, np.int64) for a in (self._point_stamps, self._pose_stamps, self._pose_log, self._flag_log)
+        )
+        if len(points) < 2:
+            raise BagError(f"{bag}: an episode needs at least 2 messages on {TRACKER_POINTS}", got=len(points))
+        if not self.ids:
+            raise BagError(f"{bag}: {TRACKER_POINTS} holds no particles in any message")
+        frames, _ = regular_stamps(points, None, bag)
+        # No grippers in the arrays: the times alone are aligned.
+        align_poses(frames, poses, np.zeros((len(poses), 0, 3)), np.zeros((len(poses), 0, 4)), f"{bag}: {GRIPPER_POSE}")
+        if self._flag_sizes != self._pose_sizes:
+            raise BagError(
+                f"{bag}: {GRIPPER_CLOSED} has {sorted(self._flag_sizes)} flags a message",
+                allowed=f"{self.grippers}, one a pose",
+            )
+        flags = np.sort(flag_times(flag_log, pose_log, poses))
+        align_flags(frames, flags, np.zeros((len(flags), 0), np.bool_), f"{bag}: {GRIPPER_CLOSED}")
+
+    def _poses(self, message: BagMessage, stamp: int, grippers: int) -> None:
+        self._pose_stamps.append(stamp)
+        self._pose_log.append(message.log_time)
+        self.grippers = max(self.grippers, grippers)
+        if self._pose_sizes and grippers not in self._pose_sizes:
+            (usual,) = self._pose_sizes
+            raise BagError(f"{message.where}: the number of grippers changes", got=f"{usual}, then {grippers}")
+        self._pose_sizes.add(grippers)
 
     def _forward(self, message: BagMessage, stamp: int) -> None:
         before = self._last.get(message.topic, [])
@@ -242,7 +285,7 @@ def _problems(reader: BagReader, contract: _Contract) -> list[str]:
         lines.append(first + (f" {more} more messages of {topic} are refused." if more else ""))
     if not lines:
         try:
-            read_episode(reader.path)
+            contract.check_times(reader.path.name)
         except BagError as error:
             lines.append(str(error))
     return lines
