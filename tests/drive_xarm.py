@@ -13,7 +13,7 @@ import time
 from typing import Any
 
 import numpy as np
-from fake_xarm import CONTROL_PORT, REPORT_PORT
+from fake_xarm import CONTROL_PORT
 from xarm.core.config.x_config import XCONF
 
 from pred_core.arm.limits import GuardConfig, bounds_of
@@ -55,7 +55,7 @@ def main(host: str) -> None:
     """Until standard input ends."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # the SDK prints from its threads
-    XCONF.SocketConf.TCP_CONTROL_PORT, XCONF.SocketConf.TCP_REPORT_RICH_PORT = CONTROL_PORT, REPORT_PORT
+    XCONF.SocketConf.TCP_CONTROL_PORT = CONTROL_PORT
     config = GuardConfig()
     arm = connect_xarm(
         host, Placement(np.zeros(3), UP), bounds_of(config), config.speed, config.angular_speed, CONTROL_PORT

@@ -16,7 +16,7 @@ import threading
 import time
 from typing import Any
 
-CONTROL_PORT, REPORT_PORT = 15502, 15302  # a real controller has 502 and 30002, which need privileges
+CONTROL_PORT, REPORT_PORT = 15502, 30002  # a real controller has 502, which needs privileges
 VERSION = b"7,7,XI130000000000,AC1300000000,v2.3.0"
 GET_VERSION, GET_SERIAL, MOTION_ENABLE, SET_STATE, GET_STATE, GET_ERROR, CLEAN_ERROR, SET_MODE = (
     1,
