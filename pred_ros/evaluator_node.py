@@ -20,11 +20,12 @@ from std_msgs.msg import String
 from pred_core.bag.wire import PREDICTION_POINTS, TRACKER_POINTS
 from pred_core.config import setting
 from pred_core.errors import ConfigError, PredError
+from pred_core.live import marks
+from pred_core.live.scoring import Scorer
 from pred_core.twin import Twin
-from pred_ros import convert, marks, qos, shell
+from pred_ros import convert, qos, shell
 from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.live_report import stage_name, write_results
-from pred_ros.scoring import Scorer
 from pred_ros.shell import Shell
 
 UNNAMED = "prediction"  # the model, if neither `model` nor `twin` says more

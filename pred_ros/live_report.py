@@ -19,11 +19,11 @@ from pred_core.errors import ConfigError, InputError
 from pred_core.evaluate.models import NamedTwin, twin_models
 from pred_core.evaluate.protocol import FIRST_PREDICTED
 from pred_core.evaluate.scores import EpisodeScore, metrics_table, over_steps, score_episode
+from pred_core.live.scoring import Scored
 from pred_core.report.animation import Track, animation
 from pred_core.report.page import Page, number
 from pred_core.twin import Twin
 from pred_core.types import Episode, Grip, ObjectInfo, Tracks
-from pred_ros.scoring import Scored
 
 SEED = 0  # of the bootstrap
 

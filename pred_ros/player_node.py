@@ -26,7 +26,8 @@ from std_srvs.srv import SetBool
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
 from pred_core.config import setting
 from pred_core.errors import ConfigError, InputError, PredError
-from pred_ros import convert, marks, qos, shell
+from pred_core.live import marks
+from pred_ros import convert, qos, shell
 from pred_ros.diagnostics import OK, WARN
 from pred_ros.playlist import Clip, Timed, find_clips, stream
 from pred_ros.shell import Shell

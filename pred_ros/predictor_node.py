@@ -28,10 +28,10 @@ from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, PREDICTION_POINTS, 
 from pred_core.config import setting
 from pred_core.dynamics import Dynamics
 from pred_core.errors import ConfigError, DivergenceError, PredError, TwinError
+from pred_core.live.prediction import Predictor, Rules
 from pred_core.twin import Twin
 from pred_ros import convert, qos, shell
 from pred_ros.diagnostics import ERROR, OK, WARN
-from pred_ros.prediction import Predictor, Rules
 from pred_ros.shell import Shell
 
 KEPT = 8  # newest messages that survive an overload: four frames with their poses, enough for a start

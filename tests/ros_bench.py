@@ -6,84 +6,20 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rclpy
-import torch
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray
+from live_world import CLOSED, points, pose
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray
 
-from pred_core.bag.clouds import PointFrame
-from pred_core.bag.grippers import PoseFrame
-from pred_core.springmass.topology import build_body
-from pred_core.twin import Twin, TwinMeta
-from pred_core.types import Grip, Physics, Scene, State
+from pred_core.types import State
 from pred_ros import convert, qos
 from pred_ros.processes import free_domain
 from pred_ros.shell import Shell
-
-PERIOD = 0.01  # [s]
-COUNT = 5  # particles on a line, 5 cm apart, the first one held
-STEP = 10_000_000  # [ns]
-START = 7_000_000_000  # [ns]
-
-
-class Straight:
-    """A Dynamics with a hand-worked result: free particles fly straight on, held ones follow their gripper."""
-
-    period = PERIOD
-
-    def __init__(self, diverges_after: int = 10**9):
-        self.left = diverges_after
-
-    def start(self, state: State, grip: Grip | None = None) -> State:
-        """Nothing to remember."""
-        return state
-
-    def step(self, state: State, grip: Grip) -> State:
-        """x + v dt; held: the gripper's place."""
-        self.left -= 1
-        position = state.position + state.velocity * PERIOD
-        held = state.held >= 0
-        position[held] = grip.position[state.held[held].long()]
-        if self.left < 0:
-            position = position * torch.nan
-        return state.replace(position=position)
-
-    def rollout(self, state: State, grips: Grip) -> torch.Tensor:
-        """Step by step."""
-        raise NotImplementedError("the predictor steps")
-
-
-def make_twin(folder: Path) -> Path:
-    """A twin of five particles, ids 0 to 4, on disk."""
-    rest = np.zeros((COUNT, 3))
-    rest[:, 0] = 0.05 * np.arange(COUNT)
-    physics = Physics(stiffness=100.0, damping=0.05, connection_threshold=0.06, max_springs=4)
-    body = build_body("line", rest, 0.05, physics, id=np.arange(COUNT, dtype=np.uint32))
-    Twin(TwinMeta(period=PERIOD), body, physics, Scene()).save(folder)
-    return folder
-
-
-def points(frame: int, ids: int = COUNT) -> PointFrame:
-    """Frame k: the line moves along x with 0.5 m/s."""
-    position = np.zeros((ids, 3))
-    position[:, 0] = 0.05 * np.arange(ids) + 0.5 * PERIOD * frame
-    identity = np.arange(ids, dtype=np.uint32)
-    return PointFrame(START + frame * STEP, position, identity, np.ones(ids, np.float32), None)
-
-
-def pose(frame: int) -> PoseFrame:
-    """The gripper holds particle 0."""
-    return PoseFrame(START + frame * STEP, points(frame).position[:1], np.array([[1.0, 0.0, 0.0, 0.0]]))
-
-
-CLOSED = np.array([True])
 
 
 class Bench:

@@ -17,16 +17,18 @@ pytest.importorskip("rclpy", reason="ROS is not installed")
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
+from live_world import COUNT, START, STEP, make_twin, points
 from rcl_interfaces.msg import Parameter as ParameterMsg
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
-from ros_bench import COUNT, START, STEP, Bench, bench_of, make_twin, own_domain, points
+from ros_bench import Bench, bench_of, own_domain
 from std_msgs.msg import String
 
 from pred_core.config import load_yaml
+from pred_core.live import marks
 from pred_core.twin import Extension, ResidualWeights, Twin
 from pred_core.types import State
-from pred_ros import bringup, convert, marks, qos, shell
+from pred_ros import bringup, convert, qos, shell
 from pred_ros.arm_node import ArmNode
 from pred_ros.evaluator_node import EvaluatorNode
 from pred_ros.live_report import stage_name

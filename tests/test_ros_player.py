@@ -14,8 +14,9 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from geometry_msgs.msg import PoseArray
+from live_world import points, pose
 from rclpy.duration import Duration
-from ros_bench import Bench, bench_of, points, pose
+from ros_bench import Bench, bench_of
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String, UInt8MultiArray
 from std_srvs.srv import SetBool
@@ -25,7 +26,8 @@ from pred_core.bag.dataset import load_dataset
 from pred_core.bag.grippers import make_gripper_closed, make_gripper_pose
 from pred_core.bag.wire import stamp_of
 from pred_core.bag.writer import BagWriter
-from pred_ros import convert, marks, qos
+from pred_core.live import marks
+from pred_ros import convert, qos
 from pred_ros.player_node import PlayerNode, unacknowledged
 from pred_ros.playlist import find_clips, stream
 

@@ -13,7 +13,8 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros_bench import CLOSED, COUNT, PERIOD, START, STEP, Bench, Straight, bench_of, make_twin, points, pose
+from live_world import CLOSED, COUNT, PERIOD, START, STEP, Straight, make_twin, points, pose
+from ros_bench import Bench, bench_of
 from std_srvs.srv import Trigger
 
 from pred_core.bag.clouds import PointFrame

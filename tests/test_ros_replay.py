@@ -16,7 +16,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
-from ros_bench import make_twin
+from live_world import make_twin
 
 from pred_core.bag.dataset import load_dataset
 from pred_core.errors import PredError

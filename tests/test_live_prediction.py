@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
-import torch
-
-pytest.importorskip("rclpy", reason="ROS is not installed")
-
 from pathlib import Path
+
+import numpy as np
+import torch
 
 from pred_core.bag.clouds import read_tracker_points
 from pred_core.bag.dataset import load_dataset
@@ -16,13 +13,13 @@ from pred_core.bag.grippers import read_gripper_closed, read_gripper_pose
 from pred_core.bag.reader import open_bag
 from pred_core.bag.wire import GRIPPER_POSE, REQUIRED, TRACKER_POINTS
 from pred_core.evaluate.protocol import predict
+from pred_core.live.prediction import Predictor, Rules
 from pred_core.pred import load_dynamics
 from pred_core.residual.config import ResidualConfig
 from pred_core.residual.network import build_network
 from pred_core.springmass.topology import build_body
 from pred_core.twin import Twin, TwinMeta
 from pred_core.types import Episode, Physics, Scene
-from pred_ros.prediction import Predictor, Rules
 
 SAMPLE = Path(__file__).parents[1] / "bags" / "sample_cable"
 

@@ -20,9 +20,9 @@ from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
 from pred_core.dynamics import Dynamics
 from pred_core.errors import DivergenceError, InputError, TwinError
+from pred_core.live.laps import Laps, Time
+from pred_core.live.prediction_records import Counts, Pose, Prediction, Rules, grip_of
 from pred_core.types import Grip, State
-from pred_ros.laps import Laps, Time
-from pred_ros.prediction_records import Counts, Pose, Prediction, Rules, grip_of
 
 ON_GRID = 0.25  # periods; a pose this close to the next step is taken as it is
 MAX_WAITING = 4_000  # tracker frames kept while poses are awaited, and poses while frames are

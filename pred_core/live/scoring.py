@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from pred_core.bag.clouds import PointFrame
 from pred_core.errors import InputError
+from pred_core.live.laps import Laps, Time
+from pred_core.live.marks import EpisodeMark
 from pred_core.metrics.correspondence import coordinate_l1, mde
 from pred_core.types import Array
-from pred_ros.laps import Laps, Time
-from pred_ros.marks import EpisodeMark
 
 LATE = 1.0  # [s] a jump back by more is a loop; by less, the message is late
 MOST_FRAMES = 100_000  # measured frames kept; beyond it the oldest episode is released (a replay in a loop)

@@ -5,19 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-
-pytest.importorskip("rclpy", reason="ROS is not installed")
-
-from ros_bench import CLOSED, COUNT, START, STEP, Straight, points, pose
+from live_world import CLOSED, COUNT, START, STEP, Straight, points, pose
 
 from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
 from pred_core.errors import InputError, TwinError
-from pred_ros import prediction
-from pred_ros.laps import AHEAD, Laps
-from pred_ros.marks import EpisodeMark
-from pred_ros.prediction import Predictor, Rules
-from pred_ros.scoring import Scorer
+from pred_core.live import prediction
+from pred_core.live.laps import AHEAD, Laps
+from pred_core.live.marks import EpisodeMark
+from pred_core.live.prediction import Predictor, Rules
+from pred_core.live.scoring import Scorer
 
 SECOND = 1_000_000_000
 IDS = np.arange(COUNT, dtype=np.uint32)
