@@ -28,6 +28,7 @@ class IdentifyConfig:
         doc="window lengths of the refinement, in order; one longer than the episodes means whole episodes",
     )
     iterations: int = setting(30, low=0, high=200, doc="refinement steps a stage; 0: CMA-ES alone")
+    shrink: float = setting(0.0, unit="m", low=0.0, high=1.0, doc="pull of profiles towards off in the refinement")
     stride: int = setting(5, low=1, high=1000, doc="frames between the residuals the refinement reads")
     estimate_starts: bool = setting(True, doc="fit starts over several frames instead of two")
     hold_out: float = setting(0.2, low=0.0, high=0.9, doc="share of the train recordings kept for the check")

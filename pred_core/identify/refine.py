@@ -18,6 +18,7 @@ from pred_core.identify.space import SearchSpace
 from pred_core.types import Array
 
 STEP = 0.05  # finite difference, in coordinates (twentieths of a typical change)
+LOG_STEP = 0.03  # finite difference of a logarithm at most
 SOFTNESS = 0.003  # [m] below which an error counts quadratically
 OUTLIER = 2.0  # times the median loss
 RIDGE = 1e-7  # of the mean curvature; 1e-4 froze profiles of a soft cable
@@ -37,32 +38,43 @@ class Refined:
     left_out: tuple[str, ...]  # episodes at least half of whose windows were outliers
 
 
-def refine(problem: Problem, space: SearchSpace, z: Array, iterations: int, stride: int, report: Report) -> Refined:
-    """The local optimum near z."""
+def refine(
+    problem: Problem, space: SearchSpace, z: Array, iterations: int, stride: int, report: Report, shrink: float = 0.0
+) -> Refined:
+    """The local optimum near z.
+
+    `shrink` [m]: the loss gains shrink/2 for every profile value that is a typical change away from off, squared;
+    without it the many values of a profile fit the noise and the damage of the recordings.
+    """
     lower, upper = (np.array(b) for b in space.bounds())
     z = np.clip(np.asarray(z, dtype=np.float64), lower, upper)
+    width = np.array([min(STEP, LOG_STEP / k.scale) if k.log else STEP for k in space.knobs])
+    pull = np.array([shrink if k.profile and not k.starts else 0.0 for k in space.knobs])
+    off = np.array([k.coordinate(k.null) if p else 0.0 for k, p in zip(space.knobs, pull, strict=True)])
     damping, loss, keep = 1e-2, np.inf, np.ones(problem.windows.count, dtype=bool)
     for iteration in range(iterations):
         # One-sided differences that stay inside the bounds; all points with the same substeps, or their differences
         # would show the integrator's error.
-        sign = np.where(z + STEP <= upper, 1.0, -1.0)
-        points = [z, *(z + STEP * sign[d] * np.eye(len(z))[d] for d in range(len(z)))]
+        step = np.where(z + width <= upper, width, -width)
+        points = [z, *(z + step[d] * np.eye(len(z))[d] for d in range(len(z)))]
         candidates = [space.candidate(p) for p in points]
         substeps = min(max(problem.substeps(c) for c in candidates), problem.most_substeps)
         rolled = problem.residuals(candidates, stride, substeps)
-        keep, loss = kept(rolled[0])
-        report(iteration, iterations, loss)
+        keep, misfit = kept(rolled[0])
+        report(iteration, iterations, misfit)
+        loss = misfit + 0.5 * float(pull @ (z - off) ** 2)
         now = rolled[0][keep]
         # A start of chaos is not a slope: no parameter moves a particle a metre per coordinate.
-        step = (STEP * sign).astype(np.float32)[:, None, None]
-        jacobian = np.clip((rolled[1:][:, keep] - now) / step, -1.0, 1.0)
+        jacobian = np.clip((rolled[1:][:, keep] - now) / step.astype(np.float32)[:, None, None], -1.0, 1.0)
         normal, slope = _normal_equations(jacobian, now)
+        normal, slope = normal + np.diag(pull), slope + pull * (z - off)
         for _ in range(PATIENCE):
             move = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(len(z)), slope)
             trial = np.clip(z + np.clip(move, -LONGEST_STEP, LONGEST_STEP), lower, upper)
             candidate = space.candidate(trial)
             finer = max(substeps, min(problem.substeps(candidate), problem.most_substeps))
             better = float(np.abs(problem.residuals([candidate], stride, finer)[0][keep]).mean())
+            better += 0.5 * float(pull @ (trial - off) ** 2)
             if better < loss:
                 break
             damping *= 6.0
