@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from std_srvs.srv import Trigger
 from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
 from pred_core.twin import Twin
-from pred_core.types import Grip, State
 from pred_ros import convert
 from pred_ros.predictor_node import PredictorNode
 
@@ -248,59 +246,6 @@ def test_twin_of_another_rate_is_said(tmp_path: Path, twin: Path) -> None:
         bench.until(feed, "a warning that names both periods")
 
 
-def test_too_slow_drops_to_the_newest_data_and_says_so(twin: Path) -> None:
-    class Slow(Straight):
-        def step(self, state: State, grip: Grip) -> State:
-            time.sleep(0.02)  # twice the period
-            return super().step(state, grip)
-
-    class SlowPredictor(PredictorNode):
-        MAKE_DYNAMICS = staticmethod(lambda _: Slow())
-
-    parameters = {"twin": str(twin), "held": "'0:0'", "overload": "newest", "max_backlog": "0.1"}
-    with bench_of(SlowPredictor, parameters) as bench:
-        def feed(frames: range) -> None:
-            """A live reader keeps the newest few clouds: take each one before the next is sent."""
-            for frame in frames:
-                bench.feed(frame)
-                count = bench.node.diagnostics.counter("messages on tracker/points") + 1
-                bench.until(
-                    lambda n=count: bench.node.diagnostics.counter("messages on tracker/points") >= n, "the cloud"
-                )
-
-        feed(range(100))
-        bench.until(lambda: bench.says(WARN, "too slow", "messages dropped"), "a warning")
-        assert bench.node.diagnostics.counter("dropped messages") > 0
-        feed(range(200, 206))
-        newest = START + 205 * STEP
-        bench.until(lambda: bench.predictions and bench.predictions[-1][0] == newest, "the newest data are predicted")
-        assert bench.predictions[-1][1].position[4, 0] == pytest.approx(0.2 + 0.005 * 205, abs=1e-5)
-        bench.node.heartbeat()
-        assert bench.node.diagnostics.level == WARN, "it predicts again, and still says that messages were dropped"
-        assert "too slow" in bench.node.diagnostics.message
-        clock = time.monotonic() + 6.0
-        bench.node.diagnostics._clock = lambda: clock
-        bench.node.heartbeat()
-        assert "too slow" not in bench.node.diagnostics.message, "six seconds later it does not"
-
-
-def test_queue_keeps_every_message_however_slow(twin: Path) -> None:
-    class Slow(Straight):
-        def step(self, state: State, grip: Grip) -> State:
-            time.sleep(0.02)
-            return super().step(state, grip)
-
-    class SlowPredictor(PredictorNode):
-        MAKE_DYNAMICS = staticmethod(lambda _: Slow())
-
-    parameters = {"twin": str(twin), "held": "'0:0'", "overload": "queue", "max_backlog": "0.1"}
-    with bench_of(SlowPredictor, parameters) as bench:
-        for frame in range(60):
-            bench.feed(frame)
-        bench.until(lambda: len(bench.predictions) == 58, "all of them")
-        assert bench.node.diagnostics.counter("dropped messages") == 0
-
-
 def test_a_cloud_without_points_does_not_end_the_node(bench: Bench) -> None:
     for frame in range(4):
         bench.feed(frame)
@@ -310,47 +255,3 @@ def test_a_cloud_without_points_does_not_end_the_node(bench: Bench) -> None:
     bench.feed(5)
     bench.until(lambda: len(bench.predictions) == 4, "predictions go on")
     assert bench.node.exit_code is None
-
-
-def test_cleanup_leaves_nothing_and_the_node_can_be_configured_again(bench: Bench) -> None:
-    node = bench.node
-
-    def made() -> list[int]:
-        return [len(list(x)) for x in (node.publishers, node.services, node.subscriptions, node.timers)]
-
-    bench.until(lambda: node._inputs, "the node listens")
-    before = made()
-    for _ in range(2):
-        node.trigger_deactivate()
-        node.trigger_cleanup()
-        idle = made()
-        assert all(a < b for a, b in zip(idle, before, strict=True)), "each kind is gone"
-        node.trigger_configure()
-        node.trigger_activate()
-        bench.until(lambda: node._inputs, "the node listens again")
-        assert made() == before, "nothing is doubled"
-    bench.until(lambda: bench.points_out.get_subscription_count() == 1, "one reader")
-    for frame in range(5):
-        bench.feed(frame)
-    bench.until(lambda: len(bench.predictions) == 3, "it predicts")
-    node.trigger_shutdown()
-    assert node._worker is None and made() == idle, "shutdown from active ends the work"
-
-
-def test_a_worker_within_a_long_horizon_ends_at_once(twin: Path) -> None:
-    class Slow(Straight):
-        def step(self, state: State, grip: Grip) -> State:
-            time.sleep(0.02)
-            return super().step(state, grip)
-
-    class SlowPredictor(PredictorNode):
-        MAKE_DYNAMICS = staticmethod(lambda _: Slow())
-
-    parameters = {"twin": str(twin), "held": "'0:0'", "horizon": "5.0", "overload": "queue"}
-    with bench_of(SlowPredictor, parameters) as bench:
-        for frame in range(10):
-            bench.feed(frame)
-        bench.until(lambda: bench.node._predictor.counts.steps > 0, "it steps; 500 steps of 20 ms follow")
-        begin = time.monotonic()
-        bench.node.stop()
-        assert time.monotonic() - begin < 1.0  # not the 10 s of the horizon
