@@ -276,9 +276,10 @@ class ArmNode(Shell):
     def _drive(self, now: int) -> None:
         """One set-point to the arm; after a disarm or a fault, until it is at rest."""
         assert self._arm is not None
+        before = self._guard.setpoint
         setpoint = self._guard.tick(now)
-        if setpoint is None or not self._following:
-            return
+        if setpoint is None or setpoint is before or not self._following:
+            return  # the same again would be a sudden halt for one period
         try:
             self._arm.command(setpoint)
             if self._guard.mode not in ACTIVE and self._guard.at_rest:
@@ -304,7 +305,7 @@ class ArmNode(Shell):
         self._guard.disarm()
         period = self._guard.bounds.period
         now = self._now()
-        for k in range(self._guard.bounds.stop_ticks + 2):
+        for k in range(self._guard.bounds.stop_ticks + 4):
             if not self._following:
                 return
             time.sleep(period)

@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
+from arm_cases import broken, measure
 from geometry_msgs.msg import PoseArray, Quaternion, Transform, Vector3
 from ros_bench import Bench, bench_of
 from sensor_msgs.msg import JointState
@@ -22,7 +23,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectory
 
 from pred_core.arm.dry_run import DryRunArm
 from pred_core.arm.guard import Mode
-from pred_core.arm.protocol import Reading
+from pred_core.arm.protocol import Reading, SetPoint
 from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import stamp_of
 from pred_core.errors import InputError
@@ -139,6 +140,8 @@ def test_a_planner_that_dies_stops_the_arm_and_only_people_start_it_again() -> N
         world.send_plan(np.array([0.06, 0.0, 0.0]), 0.5, rest=False)
         world.bench.until(lambda: world.bench.says(WARN, "stopping"), "the ramp")
         world.bench.until(lambda: world.bench.says(ERROR, "no command for 0.5 s"), "the latch")
+        world.bench.until(lambda: world.guard.at_rest, "at rest, also when the machine is busy")
+        world.wait(0.1)
         stopped = world.place()
         world.send_plan(np.array([0.02, 0.0, 0.0]), 0.5)
         world.wait(0.3)
@@ -243,3 +246,36 @@ def test_a_configuration_that_cannot_be_ends_the_process_with_one_line() -> None
             node_command("arm", parameters), env=environment, capture_output=True, text=True, timeout=30
         )
         assert done.returncode == code and word in done.stderr.strip().splitlines()[-1], done.stderr
+
+
+class Remembering(DryRunArm):
+    """A dry run that remembers its set-points."""
+
+    def __init__(self) -> None:
+        super().__init__(HOME, DOWN)
+        self.seen: list[SetPoint] = []
+        self.closes = 0
+
+    def command(self, setpoint: SetPoint) -> None:
+        """Remembered."""
+        self.seen.append(setpoint)
+        super().command(setpoint)
+
+    def close(self) -> None:
+        """Counted."""
+        self.closes += 1
+        super().close()
+
+
+def test_a_node_that_is_told_to_end_ramps_down_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    arm = Remembering()
+    monkeypatch.setattr(arm_node, "make_arm", lambda config: arm)
+    with arm_world() as world:
+        assert world.enable().success
+        world.send_plan(np.array([0.1, 0.0, 0.0]), 0.6)
+        world.bench.until(lambda: bool(arm.seen) and arm.seen[-1].velocity[0] > 0.1, "it moves")
+        bounds, before = world.guard.bounds, len(arm.seen)
+        world.node.stop()
+        assert arm.closes == 1 and not arm.seen[-1].velocity.any() and arm.seen[-1].position[0] < 0.55
+        assert 2 < len(arm.seen) - before <= bounds.stop_ticks + 4
+        assert not broken(measure(arm.seen, world.node.config))

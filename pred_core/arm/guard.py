@@ -66,7 +66,10 @@ class Guard:
     @property
     def at_rest(self) -> bool:
         """The set-point stands still, and will until a command comes."""
-        return self._smoother is None or (self._smoother.at_rest and bool((self._reference == self._out).all()))
+        if self._smoother is None or self._setpoint is None:
+            return True
+        settled = self._smoother.at_rest and bool((self._reference == self._out).all())
+        return settled and not (self._setpoint.velocity.any() or self._setpoint.angular_velocity.any())
 
     def arm(self, position: Sequence[float] | Array, rotation: Sequence[float]) -> None:
         """Begin at the measured pose: (3,) [m] world, wxyz.
@@ -206,12 +209,13 @@ class Guard:
         before, self._out = self._out, self._smoother.step(self._reference)
         position = np.clip(self._out[:3], self.bounds.low, self.bounds.high)
         rotation = orientation.from_tilt_yaw(_triple(self._out[3:]), self._upright)
+        still = rotation == self._setpoint.rotation  # the product below would round to almost zero
         turned = orientation.multiply(rotation, orientation.conjugate(self._setpoint.rotation))
         self._setpoint = SetPoint(
             position,
             rotation,
             (self._out[:3] - before[:3]) / period,
-            np.array(orientation.rotation_vector(turned)) / period,
+            np.zeros(3) if still else np.array(orientation.rotation_vector(turned)) / period,
         )
         return self._setpoint
 
