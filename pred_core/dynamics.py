@@ -9,6 +9,10 @@ from torch import Tensor
 
 from pred_core.types import Grip, State
 
+# [m] A particle with a coordinate beyond this has left any scene a hand or an arm can reach: the prediction is
+# finite but means nothing.
+FARTHEST = 100.0
+
 
 @runtime_checkable
 class Dynamics(Protocol):
@@ -31,7 +35,8 @@ class Dynamics(Protocol):
     def rollout(self, state: State, grips: Grip) -> Tensor:
         """Positions (T, ..., N, 3) after each of T periods; equals T calls of `step`.
 
-        `grips` has a leading axis T. Raises: DivergenceError if a position leaves the finite numbers.
+        `grips` has a leading axis T. Raises: DivergenceError if a position leaves the finite numbers or is
+        farther than `FARTHEST` from the origin along an axis.
         """
 
 

@@ -23,6 +23,15 @@ def line(count: int = 12, length: float = 0.55, mass: float = 0.06, radius: floa
     return build_body("line", x, mass, Physics(**values), radius=radius)  # type: ignore[arg-type]
 
 
+def zigzag(count: int, edge: float, degrees: float) -> np.ndarray:
+    """Positions (N, 3) [m] of a line bent to and fro in the plane, `degrees` between one edge and the next."""
+    x = np.zeros((count, 3))
+    half = np.radians(degrees) / 2
+    side = np.where(np.arange(count - 1) % 2, half, -half)
+    x[1:, 0], x[1:, 1] = np.cumsum(edge * np.cos(side)), np.cumsum(edge * np.sin(side))
+    return x
+
+
 def blob(rng: np.random.Generator, count: int = 40, radius: float = 0.01) -> Body:
     """A random ball of particles whose scales all differ."""
     x = rng.uniform(-0.1, 0.1, (count, 3))

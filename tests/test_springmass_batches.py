@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from springmass_cases import blob, holding, line, nobody, state_of, still
+from springmass_cases import NOWHERE, blob, holding, line, nobody, state_of, still
 
 from pred_core.effects import LIBRARY
 from pred_core.errors import ConfigError, DivergenceError, InputError, TwinError
@@ -161,7 +161,7 @@ def test_bad_input_is_named() -> None:
 
 def test_buffers_of_long_rollouts_are_not_hoarded() -> None:
     body = line()
-    sim = SpringMass(body, Physics(stiffness=0.1, damping=1e-6), substeps=1)
+    sim = SpringMass(body, Physics(stiffness=0.1, damping=1e-6), NOWHERE, substeps=1)
     state = sim.start(state_of(np.stack([body.rest_position] * 64)))
     for periods in range(900, 912):  # 8 MB each, more sizes than are kept
         sim.rollout(state, nobody(periods))

@@ -15,14 +15,10 @@ class BendingProfile(Effect):
     id = "bending_profile"
     family = "bending"
     hooks = ("bend_stiffness",)
-    parameters = (Parameter("relative", "1", -1.9, 6.0, size=KNOTS, typical=0.2, doc="p at the knots"),)
+    parameters = (Parameter("relative", "1", -1.9, 6.0, size=KNOTS, typical=1.0, doc="p at the knots"),)
     confounded_with = ("mass_profile", "rest_curvature")
 
     @classmethod
     def bend_stiffness(cls, p: Mapping[str, Any], arc: Any) -> Any:
         shape = profile(p["relative"], arc)
         return shape + 0.25 * (shape * shape)
-
-    @classmethod
-    def bend_bound(cls, p: Mapping[str, Any]) -> tuple[float, float]:
-        return max((1.0 + 0.5 * v) ** 2 for v in p["relative"]) - 1.0, 0.0

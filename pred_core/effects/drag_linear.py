@@ -21,3 +21,7 @@ class DragLinear(Effect):
     @classmethod
     def force(cls, p: Mapping[str, Any], at: ParticleContext) -> Vec3:
         return at.velocity * (-p["coefficient"][0] * at.mass)
+
+    @classmethod
+    def rate_bound(cls, p: Mapping[str, Any]) -> float:
+        return float(p["coefficient"][0])

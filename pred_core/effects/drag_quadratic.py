@@ -8,6 +8,8 @@ from typing import Any
 from pred_core.effects.algebra import Vec3
 from pred_core.effects.effect import Effect, Parameter, ParticleContext
 
+FASTEST = 5.0  # [m/s] the speed up to which the simulation must stay stable; hands and arms are slower
+
 
 class DragQuadratic(Effect):
     """f = -m b |v| v: drag of a body in turbulent flow."""
@@ -21,3 +23,7 @@ class DragQuadratic(Effect):
     @classmethod
     def force(cls, p: Mapping[str, Any], at: ParticleContext) -> Vec3:
         return at.velocity * (-p["coefficient"][0] * at.mass * at.velocity.norm())
+
+    @classmethod
+    def rate_bound(cls, p: Mapping[str, Any]) -> float:
+        return float(p["coefficient"][0]) * FASTEST

@@ -130,8 +130,16 @@ class Effect:
 
     @classmethod
     def bend_bound(cls, p: Mapping[str, Any]) -> tuple[float, float]:
-        """(relative stiffness added, damping time [s]) of a bend at most; for the choice of substeps."""
+        """(relative stiffness, damping time [s]) a `bend` hook adds to the weight at most; for the choice of substeps.
+
+        A `bend` hook's stiffness may be given as what a straight bend would need to be as stiff up to 90 degrees.
+        """
         return 0.0, 0.0
+
+    @classmethod
+    def rate_bound(cls, p: Mapping[str, Any]) -> float:
+        """Rate [1/s] at most at which a `force` hook takes a free particle's speed; for the choice of substeps."""
+        return 0.0
 
     @classmethod
     def contact(cls, p: Mapping[str, Any], at: ContactContext) -> tuple[Any, Any]:
@@ -161,12 +169,15 @@ class Effect:
             if name not in merged:
                 raise TwinError(f"effect '{cls.id}' has no parameter '{name}'", next_step=nearest(name, merged))
             given = tuple(np.atleast_1d(np.asarray(value, dtype=float)).tolist())
+            if len(given) > len(merged[name]):
+                raise TwinError(f"effect '{cls.id}': '{name}'", got=f"{len(given)} values",
+                                allowed=f"at most {len(merged[name])}")  # fmt: skip
             merged[name] = given + merged[name][len(given) :]
         return Extension(cls.id, cls.version, merged)
 
     @classmethod
     def check(cls, extension: Extension) -> None:
-        """Raise TwinError if the values do not fit the declaration (names, sizes, bounds, version)."""
+        """Raise TwinError unless the values fit the declaration: version, names, exactly `size` numbers, bounds."""
         if extension.version != cls.version:
             raise TwinError(f"effect '{cls.id}': version", got=extension.version, allowed=cls.version)
         known = {q.name: q for q in cls.parameters}
@@ -175,7 +186,8 @@ class Effect:
                 raise TwinError(f"effect '{cls.id}' has no parameter '{name}'", next_step=nearest(name, known))
         for name, q in known.items():
             values = extension.parameters.get(name)
-            if values is None or len(values) != q.size:
+            numbers = isinstance(values, tuple) and all(type(v) in (int, float) for v in values)
+            if values is None or not numbers or len(values) != q.size:
                 raise TwinError(f"effect '{cls.id}': '{name}'", got=values, allowed=f"{q.size} value(s) [{q.unit}]")
             for value in values:
                 if not (np.isfinite(value) and (value == q.null or q.low <= value <= q.high)):

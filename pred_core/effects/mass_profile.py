@@ -10,15 +10,14 @@ from pred_core.effects.profile import KNOTS, profile
 
 
 class MassProfile(Effect):
-    """m(s) -> m(s) (1 + p(s)): the total stays nearly the same."""
+    """m(s) -> m(s) (1 + p(s)), at least a quarter of it: the total mass changes with the mean of p."""
 
     id = "mass_profile"
     family = "mass"
     hooks = ("inertia",)
-    parameters = (Parameter("relative", "1", -0.9, 5.0, size=KNOTS, typical=0.2, doc="p at the knots"),)
+    parameters = (Parameter("relative", "1", -0.75, 5.0, size=KNOTS, typical=0.2, doc="p at the knots"),)
     confounded_with = ("bending_profile",)
 
     @classmethod
     def inertia(cls, p: Mapping[str, Any], arc: Any) -> Any:
-        # A quarter of the mass is the least that keeps a particle a particle.
-        return profile(p["relative"], arc).clamp_min(-0.75)
+        return profile(p["relative"], arc)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,8 +21,8 @@ class RestCurvature(Effect):
     family = "bending"
     hooks = ("bend",)
     parameters = (
-        Parameter("first", "1", -5.0, 5.0, size=KNOTS, typical=0.15, doc="k0 along the first axis, at knots"),
-        Parameter("second", "1", -5.0, 5.0, size=KNOTS, typical=0.15, doc="k0 along the second axis, at knots"),
+        Parameter("first", "1", -5.0, 5.0, size=KNOTS, typical=0.2, doc="k0 along the first axis, at knots"),
+        Parameter("second", "1", -5.0, 5.0, size=KNOTS, typical=0.2, doc="k0 along the second axis, at knots"),
         Parameter(
             "twist", "rad", -4.0, 4.0, typical=0.3, starts=(0.0, -1.57, 1.57, 3.14),
             doc="angle of the material in the last gripper against the first, untwisted"
@@ -34,3 +35,11 @@ class RestCurvature(Effect):
     def bend(cls, p: Mapping[str, Any], at: BendContext) -> tuple[Any, Any, tuple[Any, ...]]:
         first, second = profile(p["first"], at.arc), profile(p["second"], at.arc)
         return -(at.weight * first), -(at.weight * second), ()
+
+    @classmethod
+    def bend_bound(cls, p: Mapping[str, Any]) -> tuple[float, float]:
+        # With t = tan(angle/2) and k = |k0|, the energy (EI/2l) |kb - k0|^2 bends like (1+t^2)(1+3t^2 + k t) EI/l
+        # in the worst direction: 8 + 2k at 90 degrees; its slope, which turns the edges, is 4 + 2k there. Relative to
+        # k = 0 both add k/2 at most. At rest, t = k/2, which may be sharper than 90 degrees, it is (1+t^2)^2.
+        k = max(math.hypot(a, b) for a, b in zip(p["first"], p["second"], strict=True))
+        return max(0.5 * k, (1.0 + 0.25 * k * k) ** 2 / 8.0 - 1.0), 0.0

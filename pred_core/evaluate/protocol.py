@@ -9,14 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pred_core.dynamics import Dynamics
+from pred_core.dynamics import FARTHEST, Dynamics
 from pred_core.errors import DatasetError, DivergenceError, TwinError
 from pred_core.train.recordings import PERIOD_TOLERANCE
 from pred_core.types import Array, Episode, Grip, State, stack_grips, stack_states
 
 START_FRAME = 1  # the state is measured at this frame, its velocity from this frame and the one before
 FIRST_PREDICTED = START_FRAME + 1
-FARTHEST = 100.0  # [m] a particle farther than this from the origin has left the scene: diverged
 
 
 @runtime_checkable

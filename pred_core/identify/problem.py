@@ -16,7 +16,8 @@ from pred_core.identify.topology import Topology
 from pred_core.identify.windows import Windows
 from pred_core.springmass import SpringMass
 from pred_core.springmass.arrays import mass_of_worlds
-from pred_core.springmass.stability import SAFETY, spectrum_bound
+from pred_core.springmass.parameters import added_by
+from pred_core.springmass.stability import demand
 from pred_core.types import Array, Body, Grip, Physics, Scene, State
 
 DIVERGED = 1.0  # [m] the error a world counts with from where it is not finite
@@ -32,7 +33,8 @@ class Problem:
     """Losses of candidates on windows.
 
     `most_substeps` bounds stiffness: a candidate that needs more is not simulated but charged `DIVERGED` and how far
-    it is beyond, so that a search returns from there. So is one whose springs leave particles loose.
+    it is beyond, so that a search returns from there. So is one whose springs leave particles loose. A candidate that
+    needs up to `room` times as many is simulated with `most_substeps`.
     """
 
     def __init__(
@@ -43,10 +45,10 @@ class Problem:
         windows: Windows,
         most_substeps: int,
         topology: Topology | None = None,
+        room: float = 1.0,
     ):
         self.body, self.scene, self.period, self.windows = body, scene, period, windows
-        self.most_substeps, self.topology = most_substeps, topology
-        self.room = 1.0  # how far beyond `most_substeps` a candidate may ask and be simulated with those
+        self.most_substeps, self.topology, self.room = most_substeps, topology, room
         always = (windows.start.held >= 0).all(dim=0) & (windows.held >= 0).flatten(0, 1).all(dim=0)
         self.held: NDArray[np.bool_] = always.numpy()  # (N,) particles that never move freely
         free = np.flatnonzero(~self.held)
@@ -59,20 +61,17 @@ class Problem:
         """Substeps a period that keep this candidate stable (`springmass.stability`), neither rounded nor limited."""
         body = self.body if self.topology is None else self.topology.body(candidate.physics)
         effects = tuple(find_effect(e.id) for e in candidate.extensions)
-        bounds = [e.bend_bound(x.parameters) for e, x in zip(effects, candidate.extensions, strict=True)]
-        bend = (sum(b[0] for b in bounds), sum(b[1] for b in bounds))
         mass = None
         if any("inertia" in e.hooks for e in effects):
             mass = mass_of_worlds(body, [candidate.extensions], effects)[0].double().numpy()
-        w, d = spectrum_bound(body, candidate.physics, bend, self.held, mass)
-        return self.period * (d + math.sqrt(d * d + 4.0 * w * w)) / (4.0 * SAFETY)
+        return demand(body, self.period, candidate.physics, added_by(body, candidate.extensions), self.held, mass)
 
     def substeps(self, candidate: Candidate) -> int:
         """What this candidate is simulated with, a rung; what it needs if that is beyond `most_substeps`."""
         needed = max(1, math.ceil(self.demand(candidate)))
         if needed > self.room * self.most_substeps:
             return needed
-        return min(next(r for r in RUNGS if r >= needed), self.most_substeps)
+        return min(next((r for r in RUNGS if r >= needed), needed), self.most_substeps)
 
     def losses(self, candidates: Sequence[Candidate], substeps: int | None = None) -> Array:
         """(C, W) mean absolute error per coordinate [m] of free particles, over the window.

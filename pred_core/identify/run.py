@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -87,7 +88,8 @@ def identify(
         best, refined = stages.refine(recordings, space, best, config.stages[-1:])
     tell("evidence: intervals and sensitivities")
     problem = stages.whole(recordings)
-    substeps = min(problem.substeps(best), config.substeps)
+    # What keeps it stable whatever the motion, also where the refinement was simulated with fewer.
+    substeps = max(1, math.ceil(problem.demand(best)))
     losses = problem.losses([best], substeps)[0]
     wall = config.substeps * (1.0 if refined is None else ROOM)
     values = gather_evidence(problem, space, searched, best, restarts, wall)

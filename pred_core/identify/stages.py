@@ -48,21 +48,22 @@ class Stages:
         count: int | None = None,
         body: Body | None = None,
         topology: Topology | None = None,
+        most_substeps: int | None = None,
+        room: float = 1.0,
     ) -> Problem:
-        """Windows of `seconds` over the recordings; whole recordings where they are shorter."""
+        """Windows of `seconds` over the recordings; whole recordings where they are shorter. See `Problem`."""
         longest = max(len(r.position) for r in recordings) - 2
         steps = min(round(min(seconds, 1e6) / self.period), longest)
         most = count or max(MOST_WINDOWS, len(recordings))
         index = draw_windows(recordings, steps, most, torch.Generator().manual_seed(self.config.seed))
         windows = make_windows(recordings, index, steps, self.period, self.noise)
-        c = self.config
-        return Problem(body or self.layout.body, self.layout.scene, self.period, windows, c.substeps, topology)
+        bound = most_substeps or self.config.substeps
+        return Problem(body or self.layout.body, self.layout.scene, self.period, windows, bound, topology, room)
 
     def whole(self, recordings: Sequence[Recording]) -> Problem:
         """The longest windows, with all springs that were searched and no bound on stiffness: to judge with."""
-        problem = self.problem(recordings, self.config.stages[-1], topology=self.topology)
-        problem.most_substeps = MOST_SUBSTEPS
-        return problem
+        longest = self.config.stages[-1]
+        return self.problem(recordings, longest, topology=self.topology, most_substeps=MOST_SUBSTEPS)
 
     def body(self, physics: Physics) -> Body:
         """The body with the springs these parameters make."""
@@ -118,8 +119,7 @@ class Stages:
     ) -> tuple[Candidate, Refined | None]:
         refined = None
         for length in seconds:
-            problem = self.problem(recordings, length, body=self.body(start.physics))
-            problem.room = ROOM
+            problem = self.problem(recordings, length, body=self.body(start.physics), room=ROOM)
             local = space.at(start)
             steps = len(problem.windows.target)
             title = f"refine: {problem.windows.count} windows of {steps * self.period:.1f} s"

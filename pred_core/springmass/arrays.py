@@ -15,6 +15,7 @@ from pred_core.effects.effect import Effect
 from pred_core.errors import TwinError
 from pred_core.frames import quaternion_normalize, quaternion_to_matrix
 from pred_core.springmass import kernel
+from pred_core.springmass.topology import bend_lengths
 from pred_core.twin import Extension
 from pred_core.types import Array, Body, Box, Capsule, Fixture, Scene, Sphere
 
@@ -88,17 +89,6 @@ def bend_rows(body: Body) -> Array:
     lbar = bend_lengths(body)
     share = np.concatenate([lbar[a:b] / lbar[a:b].sum() for a, b in chains(body)])
     return np.stack((body.bend_scale / lbar, lbar, body.arc[body.bends[:, 1]], share), axis=1)
-
-
-def bend_lengths(body: Body) -> Array:
-    """(B,) [m] half the sum of a bend's two edges at rest: a spring's rest length, or the distance."""
-    rest = {tuple(p): length for p, length in zip(body.springs.tolist(), body.rest_length.tolist(), strict=True)}
-
-    def edge(a: int, b: int) -> float:
-        fallback = float(np.linalg.norm(body.rest_position[b] - body.rest_position[a]))
-        return rest.get((min(a, b), max(a, b)), fallback)
-
-    return np.array([0.5 * (edge(a, b) + edge(b, c)) for a, b, c in body.bends.tolist()])
 
 
 def chains(body: Body) -> NDArray[np.int32]:

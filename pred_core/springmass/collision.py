@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -13,11 +13,11 @@ from pred_core.types import Body, Grip, State
 NEAR_RINGS = 3  # springs away along the object within which particles never collide
 
 
-def candidate_pairs(body: Body, state: State, before: Grip, grips: Grip, period: float) -> Tensor:
+def candidate_pairs(body: Body, near: csr_matrix, state: State, before: Grip, grips: Grip, period: float) -> Tensor:
     """(C, 2) int32 pairs that could come within two radii in the first `period` [s], over all worlds.
 
     Speeds are taken from the state (W, N, 3) and from the grippers' way; a radius a particle is left for what
-    they gain within the period. Worlds that diverged are left out.
+    they gain within the period. Pairs of `near` (`connected_within`) and worlds that diverged are left out.
     """
     alive = torch.isfinite(state.position + state.velocity).all(-1).all(-1)
     position, velocity = state.position[alive], state.velocity[alive]
@@ -28,12 +28,11 @@ def candidate_pairs(body: Body, state: State, before: Grip, grips: Grip, period:
     found = [cKDTree(world).query_pairs(reach, output_type="ndarray") for world in position.cpu().double().numpy()]
     pairs = np.unique(np.sort(np.concatenate(found), axis=1), axis=0) if found else np.zeros((0, 2), dtype=np.int64)
     if len(pairs):
-        near = connected_within(body, NEAR_RINGS)
         pairs = pairs[np.asarray(near[pairs[:, 0], pairs[:, 1]]).ravel() == 0]
     return torch.as_tensor(pairs.astype(np.int32), device=position.device)
 
 
-def connected_within(body: Body, rings: int) -> coo_matrix:
+def connected_within(body: Body, rings: int = NEAR_RINGS) -> csr_matrix:
     """Sparse (N, N), nonzero where two particles are at most `rings` springs apart."""
     s = body.springs
     ones = np.ones(len(s))

@@ -10,8 +10,9 @@ from torch import Tensor
 from pred_core.effects import find_effect
 from pred_core.effects.effect import Effect
 from pred_core.errors import ConfigError
+from pred_core.springmass.stability import Added
 from pred_core.twin import Extension
-from pred_core.types import Physics
+from pred_core.types import Body, Physics
 
 PerWorld = list[tuple[Extension, ...]]
 
@@ -41,13 +42,22 @@ def effects_of(per_world: PerWorld) -> tuple[type[Effect], ...]:
     return effects
 
 
-def bend_bounds(per_world: PerWorld, worlds: int) -> list[tuple[float, float]]:
-    """Relative bending stiffness and bending damping time [s] that each world's effects add."""
-    bounds = []
-    for extensions in per_world:
-        pairs = [find_effect(e.id).bend_bound(e.parameters) for e in extensions]
-        bounds.append((sum(p[0] for p in pairs), sum(p[1] for p in pairs)))
-    return [bounds[w % len(bounds)] for w in range(worlds)]
+def added_by(body: Body, extensions: Sequence[Extension]) -> Added:
+    """What these effects add to the body at most, for the choice of substeps.
+
+    As in the kernel: `bend_stiffness` hooks scale the weight EI/lbar, `bend` hooks multiply what they return by it.
+    """
+    arc = torch.as_tensor(body.arc[body.bends[:, 1]])
+    scale, stiffness, time, rate = torch.ones_like(arc), 0.0, 0.0, 0.0
+    for extension in extensions:
+        effect = find_effect(extension.id)
+        if "bend_stiffness" in effect.hooks:
+            scale = scale + effect.bend_stiffness(extension.parameters, arc)
+        more, seconds = effect.bend_bound(extension.parameters)
+        stiffness += more
+        time += seconds
+        rate += effect.rate_bound(extension.parameters)
+    return Added(scale.numpy(), stiffness, time, rate)
 
 
 def parameter_rows(physics: list[Physics], per_world: PerWorld, effects: tuple[type[Effect], ...]) -> Tensor:

@@ -18,7 +18,7 @@ from pred_core.effects.effect import ContactContext, Effect, GripContext, Partic
 from pred_core.frames import quaternion_normalize, quaternion_rotate, quaternion_to_matrix
 from pred_core.springmass import grasp
 from pred_core.springmass.arrays import bend_rows, chains, mass_of_worlds
-from pred_core.springmass.collision import candidate_pairs
+from pred_core.springmass.collision import candidate_pairs, connected_within
 from pred_core.springmass.parameters import effects_of, extensions_per_world
 from pred_core.springmass.reference_bending import BendMemory, bend_forces
 from pred_core.twin import Extension
@@ -63,6 +63,7 @@ class Reference:
         self.bending = column([p.bending_stiffness for p in self.physics])
         self.arc = torch.as_tensor(self.body.arc)[None]
         self.bend_rows = torch.as_tensor(bend_rows(self.body))
+        self.near = connected_within(self.body) if self.self_collision else None
         self.lines = [(int(a), int(b)) for a, b in chains(self.body)]
 
     def rollout(self, state: State, grips: Grip) -> tuple[Tensor, Tensor]:
@@ -79,9 +80,9 @@ class Reference:
             after = Grip(grips.position[t].double(), turned, grips.closed[t])
             now = State(x, v, held, {"grip_offset": offset})
             held, offset = grasp.close_and_open(now, before, after.closed, self.scene.grasp_radius)
-            if self.self_collision:
+            if self.near is not None:
                 nexts = Grip(after.position[None], after.rotation[None], after.closed[None])
-                pairs = candidate_pairs(self.body, State(x, v, held), before, nexts, self.period).long()
+                pairs = candidate_pairs(self.body, self.near, State(x, v, held), before, nexts, self.period).long()
             for sub in range(self.substeps):
                 time = torch.full_like(self.stiffness, (t * self.substeps + sub) * h)
                 alpha = sub / self.substeps

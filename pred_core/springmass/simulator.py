@@ -9,12 +9,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pred_core.errors import DivergenceError, InputError
+from pred_core.dynamics import FARTHEST
+from pred_core.errors import ConfigError, DivergenceError, InputError
 from pred_core.springmass import grasp, kernel
 from pred_core.springmass.arrays import ModelArrays, chains, mass_of_worlds
-from pred_core.springmass.collision import candidate_pairs
+from pred_core.springmass.collision import candidate_pairs, connected_within
 from pred_core.springmass.lanes import pack, pack_into, unpack
-from pred_core.springmass.parameters import bend_bounds, effects_of, extensions_per_world, parameter_rows
+from pred_core.springmass.parameters import added_by, effects_of, extensions_per_world, parameter_rows
 from pred_core.springmass.stability import choose_substeps
 from pred_core.springmass.workspace import Size, Workspace
 from pred_core.twin import Extension
@@ -57,13 +58,18 @@ class SpringMass:
         each = [self.physics[w % len(self.physics)] for w in range(self.worlds)]
         self._mass = mass_of_worlds(body, per_world, self.effects).to(device)
         masses = list(self._mass.double().cpu().numpy().repeat(self.worlds // len(self._mass), axis=0))
-        bounds = bend_bounds(per_world, self.worlds)
-        self.substeps = substeps or choose_substeps(body, period, each, bounds, masses=masses)
+        if substeps is not None and substeps < 1:
+            raise ConfigError("substeps a period", got=substeps, allowed="1 or more; None: by stability")
+        if substeps is None:
+            rows = [added_by(body, extensions) for extensions in per_world]
+            added = [rows[w % len(rows)] for w in range(self.worlds)]
+            substeps = choose_substeps(body, period, each, added, masses=masses)
+        self.substeps = substeps
         self.diverged_as_nan = diverged_as_nan
         self.staged = device != "cpu" if staged is None else staged
         self._rows = parameter_rows(self.physics, per_world, self.effects).to(device)
         self._mask = spring_mask
-        self._self_collision = self_collision
+        self._near = connected_within(body) if self_collision else None
         self._arrays = ModelArrays.of(body, scene, device)
         self._lines = chains(body)
         framed = any("bend" in e.hooks for e in self.effects)
@@ -100,8 +106,8 @@ class SpringMass:
         flat, lead = self._flatten(state)
         poses = grasp.flatten_grip(grip, lead, self.device)
         after, _ = self._advance(flat, Grip(poses.position[None], poses.rotation[None], poses.closed[None]), False)
-        self._check(after.position)
-        return _unflatten(after, lead)
+        position = self._check(after.position[None])[0]
+        return _unflatten(after.replace(position=position), lead)
 
     def rollout(self, state: State, grips: Grip) -> Tensor:
         """Positions (T, ..., N, 3) over T periods in one kernel call. See `Dynamics.rollout`."""
@@ -117,14 +123,16 @@ class SpringMass:
             grips = Grip(grips.position.unsqueeze(1), grips.rotation.unsqueeze(1), grips.closed.unsqueeze(1))
         stacked = grasp.flatten_grip(grips, torch.Size((periods, *lead)), self.device)
         stacked = Grip(*(v.unflatten(0, (periods, lead.numel())) for v in vars(stacked).values()))
-        spans = [(t, t + 1) for t in range(periods)] if self._self_collision else _constant_spans(stacked.closed)
+        spans = [(t, t + 1) for t in range(periods)] if self._near is not None else _constant_spans(stacked.closed)
         parts = []
         for begin, end in spans:
             flat, trajectory = self._advance(flat, stacked.span(begin, end), True)
             parts.append(trajectory)
         positions = parts[0] if len(parts) == 1 else torch.cat(parts)
-        self._check(positions)
-        return positions.reshape(periods, *lead, self.body.count, 3), _unflatten(flat, lead)
+        checked = self._check(positions)
+        if checked is not positions:
+            flat = flat.replace(position=checked[-1])
+        return checked.reshape(periods, *lead, self.body.count, 3), _unflatten(flat, lead)
 
     def _advance(self, state: State, grips: Grip, record: bool) -> tuple[State, Tensor]:
         """T periods with constant `closed`; state (W, ...), grips (T, W, G, ...). Returns (state, (T, W, N, 3))."""
@@ -152,8 +160,8 @@ class SpringMass:
             pack_into(tensors["time"], memory["time"])
         if self._memory_size:
             pack_into(tensors["memory"], memory["effects"])
-        if self._self_collision:
-            pairs = candidate_pairs(self.body, state, before, grips, self.period)
+        if self._near is not None:
+            pairs = candidate_pairs(self.body, self._near, state, before, grips, self.period)
             work.model.pairs = wp.from_torch(pairs.flatten().contiguous(), dtype=wp.int32)
             work.model.pair_count = len(pairs)
             work.changed()
@@ -246,16 +254,19 @@ class SpringMass:
                                  next_step="Check what measured or predicted it")  # fmt: skip
         return flat, lead
 
-    def _check(self, positions: Tensor) -> None:
-        """(T, W, N, 3) or (W, N, 3): raise DivergenceError at the first period that is not finite."""
-        if self.diverged_as_nan or math.isfinite(float(positions.sum())):
-            return
-        bad = ~torch.isfinite(positions.reshape(-1, *positions.shape[-3:])).flatten(2).all(-1)
-        if not bool(bad.any()):
-            return
+    def _check(self, positions: Tensor) -> Tensor:
+        """(T, W, N, 3) as given, or with NaN from where a world diverged, if it may. Raises: DivergenceError."""
+        low, high = torch.aminmax(positions)
+        if float(low) >= -FARTHEST and float(high) <= FARTHEST:  # false for NaN
+            return positions
+        bad = ~(positions.abs() <= FARTHEST).flatten(2).all(-1)  # (T, W)
+        if self.diverged_as_nan:
+            return positions.masked_fill((bad.cumsum(0) > 0)[..., None, None], math.nan)
         period, world = torch.nonzero(bad)[0].tolist()
+        finite = bool(torch.isfinite(positions[period, world]).all())
+        where = f"went farther than {FARTHEST:g} m from the origin" if finite else "left the finite numbers"
         raise DivergenceError(
-            f"the simulation left the finite numbers at step {period + 1} of world {world}",
+            f"the simulation {where} at step {period + 1} of world {world}",
             got=f"{self.substeps} substeps a period", next_step="Use more substeps, or less stiffness and damping",
         )  # fmt: skip
 

@@ -143,6 +143,26 @@ def straight_bends(position: Array, springs: Springs) -> Springs:
     return np.array(bends, dtype=np.int32).reshape(-1, 3)
 
 
+def bend_edges(body: Body) -> Array:
+    """(B, 2) [m] a bend's two edges at rest: a spring's rest length, or the distance where there is no spring."""
+    springs = np.sort(body.springs, axis=1).astype(np.int64)
+    keys = springs[:, 0] * body.count + springs[:, 1]
+    order = np.argsort(keys)
+    pairs = np.stack((body.bends[:, :2], body.bends[:, 1:]), axis=1)  # (B, 2, 2)
+    ends = np.sort(pairs, axis=2).astype(np.int64)
+    distance = np.linalg.norm(body.rest_position[ends[..., 1]] - body.rest_position[ends[..., 0]], axis=2)
+    if not len(keys):
+        return np.asarray(distance)
+    wanted = ends[..., 0] * body.count + ends[..., 1]
+    place = order[np.searchsorted(keys, wanted, sorter=order).clip(max=len(keys) - 1)]
+    return np.where(keys[place] == wanted, body.rest_length[place], distance)
+
+
+def bend_lengths(body: Body) -> Array:
+    """(B,) [m] half the sum of a bend's two edges at rest, the length lbar it stands for."""
+    return np.asarray(0.5 * bend_edges(body).sum(axis=1))
+
+
 def loose_particles(count: int, springs: Springs) -> list[int]:
     """Particles not connected to particle 0 by springs; an object with any falls apart."""
     if len(springs) == 0:
