@@ -5,9 +5,10 @@ Gershgorin's theorem (a spring's 2x2 block adds 2k/m at most).
 
 Bends stiffen with their angle: of E = (2 EI/lbar) t^2, t = tan(angle/2), the second derivative by the angle is
 (1 + t^2)(1 + 3 t^2) EI/lbar, and damping of kb = 2t is (1 + t^2)^2 tau EI/lbar. The choice is safe up to
-`SHARPEST`, 90 degrees between edges; a line folded sharper than that for long needs more. Bends so sharp also press
+`SHARPEST`, 90 degrees between edges; a line folded sharper than that needs more. Bends so sharp also press
 edges together, by the slope of E over the edge, (2 EI/lbar) t (1 + t^2) / edge [N], against the spring's stiffness;
-shorter edges make stiffer bends (1/edge^2). This counts where bends rival the springs, up to `MOST_PRESSED`.
+shorter edges make stiffer bends (1/edge^2). This counts where bends rival the springs, up to `MOST_PRESSED`; tests show
+it safe where springs yield by a quarter to their own bends. Undamped springs that yield by half or more may blow up.
 """
 
 from __future__ import annotations
