@@ -130,7 +130,7 @@ def test_sharp_bends_are_stable_at_the_chosen_substeps(stiffness: float, degrees
 def test_contact_adds_no_energy() -> None:
     body = line(mass=0.2, radius=0.004)
     physics = Physics(stiffness=60.0, damping=0.05, bending_stiffness=5e-3, ground_friction=0.4)
-    sim = SpringMass(body, physics, Scene(ground=0.0), substeps=60)
+    sim = SpringMass(body, physics, Scene(ground=0.0))
     dropped = body.rest_position @ rotation_about_z(torch.tensor(0.3)).double().numpy().T + [0, 0, 0.1]
     dropped[:, 2] += 0.02 * np.sin(np.arange(12))
     state = sim.start(state_of(dropped))
