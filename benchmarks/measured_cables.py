@@ -34,12 +34,12 @@ from pred_core.bag.dataset import Dataset, load_dataset, write_dataset
 from pred_core.bag.measured import measured_or_explain
 
 EFFECTS = "bending_damping,bending_hysteresis,rest_curvature,bending_profile"
-CONTINUOUS = "stiffness,damping,bending_stiffness"  # first neighbours alone: skip springs would bend a second time
+CONTINUOUS = "stiffness,bending_stiffness"  # first neighbours alone (skip springs bend a second time), no dashpot (not shown)
 IDENTIFY = {
     "paper": ["--paper"],
     "drag": ["--effects", "drag_linear"],
     "chain": ["--effects", "bending_damping", "--parameters", CONTINUOUS],
-    "extended": ["--effects", EFFECTS, "--parameters", CONTINUOUS, "--restarts", "2"],
+    "extended": ["--effects", EFFECTS, "--parameters", CONTINUOUS, "--restarts", "1", "--shrink", "3e-6"],
 }
 TRAIN = shlex.split(
     "--no-azimuth --gradient detached --carry 124 --rollout 4 --loss smooth --beta 0.3 --cap 0.02 --penalty 0.3 "

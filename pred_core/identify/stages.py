@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 
 from pred_core.identify.body import Layout
@@ -23,6 +22,7 @@ from pred_core.train.recordings import Recording
 from pred_core.types import Body, Physics
 
 Tell = Callable[[str], None]
+FINALISTS = 2  # of the starts of a refinement, that see the longest windows
 MOST_WINDOWS = 112  # of a refinement stage shorter than an episode
 # Substeps are chosen at half the stability limit. A search that ends there may be refined beyond, still stable: at the
 # wall every small step would be charged and nothing could move.
@@ -92,7 +92,7 @@ class Stages:
         """The local refinement of everything continuous, over windows of these lengths in order.
 
         Knobs that were not searched start at their first start where they are off; each other start of one of them
-        is tried too, through all lengths but the last, and the best goes on.
+        is tried too, through all lengths but the last, and the best two go through the last.
         """
         knobs = tuple(k for k in space.knobs if k.name not in DISCRETE)
         if self.config.iterations == 0 or not knobs:
@@ -110,9 +110,15 @@ class Stages:
                     z = first.copy()
                     z[n] = knob.coordinate(value)
                     trials.append(local.candidate(z))
-        ends = [self._lengths(recordings, local, trial, seconds[:-1]) for trial in trials]
-        best = min(ends, key=lambda end: np.inf if end[1] is None else end[1].loss)
-        return self._lengths(recordings, local, best[0], seconds[-1:])
+        if len(trials) > 1:
+            ends = [self._lengths(recordings, local, trial, seconds[:-1])[0] for trial in trials]
+            trials = sorted(ends, key=lambda end: self._score(recordings, end))[:FINALISTS]
+        finals = [self._lengths(recordings, local, trial, seconds[-1:]) for trial in trials]
+        return min(finals, key=lambda end: self._score(recordings, end[0]))
+
+    def _score(self, recordings: Sequence[Recording], candidate: Candidate) -> float:
+        """Error [m] on the best 90 % of the longest windows: the same windows' rule for every candidate."""
+        return float(trimmed(self.whole(recordings).losses([candidate]))[0])
 
     def _lengths(
         self, recordings: Sequence[Recording], space: SearchSpace, start: Candidate, seconds: Sequence[float]
@@ -128,7 +134,7 @@ class Stages:
                 self.tell(f"{title}, step {done}/{planned}, {1e3 * loss:.3f} mm")
 
             stride = min(self.config.stride, steps)
-            refined = refine(problem, local, local.start(), self.config.iterations, stride, report)
+            refined = refine(problem, local, local.start(), self.config.iterations, stride, report, self.config.shrink)
             start = local.candidate(refined.z)
         return start, refined
 
