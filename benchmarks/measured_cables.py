@@ -34,7 +34,7 @@ from pred_core.bag.dataset import Dataset, load_dataset, write_dataset
 from pred_core.bag.measured import measured_or_explain
 
 EFFECTS = "bending_damping,bending_hysteresis,rest_curvature,bending_profile"
-CONTINUOUS = "stiffness,bending_stiffness"  # first neighbours alone (skip springs bend a second time), no dashpot (not shown)
+CONTINUOUS = "stiffness,bending_stiffness"  # first neighbours alone: skip springs would bend a second time
 IDENTIFY = {
     "paper": ["--paper"],
     "drag": ["--effects", "drag_linear"],
