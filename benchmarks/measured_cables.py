@@ -15,7 +15,7 @@ Which flags make which numbers, for each cable (dlo1, dlo2):
         of the published split once a fold
 
 Without --folds there is no row grouped by recording; without --train-folds there is none of pred. Fold twins are
-refined in two stages (--stages 1.0,1e9) instead of the default ones, to save time.
+refined in two stages and hold nothing out (--stages 1.0,1e9 --hold-out 0), to save time.
 
 Each step is a `pred` command, printed as it runs, and is skipped when its result is there.
 """
