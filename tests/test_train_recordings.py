@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 from residual_case import PERIOD, Falling, episodes, line_body
+from torch import Tensor
 
-from pred_core.errors import DatasetError
+from pred_core.errors import DatasetError, DivergenceError
 from pred_core.identify.windows import draw_windows
 from pred_core.train import Recording, align
 from pred_core.train.outliers import backbone_error, leave_out
 from pred_core.train.recordings import gather, split_groups, start_frames, window_index
-from pred_core.types import Episode, Grip
+from pred_core.types import Episode, Grip, State
 
 
 def recordings(number: int = 3, frames: int = 12) -> list[Recording]:
@@ -108,3 +109,24 @@ def test_groups_are_never_split() -> None:
     assert split_groups(data, 0.0, torch.Generator())[1] == []
     with pytest.raises(DatasetError, match="--holdout 0"):
         split_groups(data[:3], 0.3, torch.Generator())
+
+
+class Fragile(Falling):
+    """Diverges where a recording starts faster than 100 m/s: a marker that jumped."""
+
+    def rollout(self, state: State, grips: Grip) -> Tensor:
+        """By steps. Raises: DivergenceError."""
+        if bool((state.velocity.norm(dim=-1) > 100.0).any()):
+            raise DivergenceError("too fast")
+        return super().rollout(state, grips)
+
+
+def test_a_recording_the_backbone_diverges_on_is_left_out_and_named() -> None:
+    data = recordings(4)
+    position = data[2].position.clone()
+    position[1, 3] += 5.0  # a marker jumps 5 m between the first two frames
+    data[2] = dataclasses.replace(data[2], position=position)
+    error = backbone_error(Fragile(drag=0.1), data)
+    kept, left_out = leave_out(Fragile(drag=0.1), data, factor=3.0)
+    assert torch.isfinite(error).all() and [r.name for r in left_out] == ["throw2"]
+    assert [r.name for r in kept] == ["throw0", "throw1", "throw3"]

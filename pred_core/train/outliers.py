@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pred_core.dynamics import Dynamics
-from pred_core.errors import DatasetError
+from pred_core.dynamics import FARTHEST, Dynamics
+from pred_core.errors import DatasetError, DivergenceError
 from pred_core.train.recordings import Recording, beginnings, gather, window_index
+from pred_core.types import Grip, State
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def leave_out(base: Dynamics, recordings: Sequence[Recording], factor: float) ->
 
 
 def backbone_error(base: Dynamics, recordings: Sequence[Recording]) -> Tensor:
-    """(R,) [mm] open-loop mean absolute error per coordinate of every recording."""
+    """(R,) [mm] open-loop mean absolute error per coordinate of every recording; `FARTHEST` where it diverges."""
     steps = max(1, min(len(r.position) for r in recordings) // 2)
     index = beginnings(window_index(recordings, steps, 1))
     if len(index) != len(recordings):
@@ -54,6 +55,22 @@ def backbone_error(base: Dynamics, recordings: Sequence[Recording]) -> Tensor:
         )
     batch = gather(recordings, index, steps, base.period, torch.device("cpu"))
     with torch.no_grad():
-        position = base.rollout(base.start(batch.start, batch.start_grip), batch.grips).cpu()
+        state = base.start(batch.start, batch.start_grip)
+        try:
+            position = base.rollout(state, batch.grips).cpu()
+        except DivergenceError:
+            position = torch.stack([_alone(base, state, batch.grips, n) for n in range(len(index))], dim=1)
     difference = (position - batch.target).abs() * batch.seen.unsqueeze(-1)
     return 1e3 * difference.sum(dim=(0, 2, 3)) / (3 * batch.seen.sum(dim=(0, 2))).clamp_min(1)
+
+
+def _alone(base: Dynamics, state: State, grips: Grip, world: int) -> Tensor:
+    """Positions (T, N, 3) of one world; all at `FARTHEST` if it diverges, as damaged tracks make a backbone do."""
+    one = State(
+        state.position[world], state.velocity[world], state.held[world], {k: v[world] for k, v in state.memory.items()}
+    )
+    alone = Grip(grips.position[:, world], grips.rotation[:, world], grips.closed[:, world])
+    try:
+        return base.rollout(one, alone).cpu()
+    except DivergenceError:
+        return torch.full((len(grips.position), *state.position.shape[1:]), FARTHEST)
