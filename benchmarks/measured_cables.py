@@ -102,7 +102,8 @@ def fold_twins(dataset: Dataset, root: Path, folds: int) -> Path:
             )  # fmt: skip
         chain = twins / f"chain{number}"
         identify(part, chain, IDENTIFY["chain"])
-        identify(part, twins / f"fold{number}", [*IDENTIFY["extended"], "--stages", "1.0,1e9", "--hold-out", "0", "--base", str(chain)])
+        flags = [*IDENTIFY["extended"], "--stages", "1.0,1e9", "--hold-out", "0", "--base", str(chain)]
+        identify(part, twins / f"fold{number}", flags)
     return twins
 
 

@@ -103,8 +103,12 @@ def load_config(cls: type[T], path: Path) -> T:
 
 def to_mapping(config: Any) -> dict[str, Any]:
     """Plain dict of a config dataclass, fit for YAML."""
-    plain = dataclasses.asdict(config)
-    return {k: list(v) if isinstance(v, tuple) else v for k, v in plain.items()}
+    return {k: _plain(v) for k, v in dataclasses.asdict(config).items()}
+
+
+def _plain(value: Any) -> Any:
+    """Tuples as lists, at any depth."""
+    return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
 
 
 class _StrictLoader(yaml.SafeLoader):

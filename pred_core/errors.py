@@ -20,7 +20,7 @@ class PredError(ValueError):
             parts.append(f"allowed: {allowed}")
         line = "; ".join(parts) + "."
         if next_step:
-            line += f" {next_step.rstrip('.')}."
+            line += f" {next_step.rstrip('.')}" + ("" if next_step.endswith("?") else ".")
         super().__init__(" ".join(line.split()))
 
 

@@ -59,6 +59,7 @@ class TwinMeta:
     object: ObjectInfo = ObjectInfo()
     period: float = setting(0.01, unit="s", low=1e-4, high=1.0, doc="time one step covers")
     substeps: int | None = setting(None, low=1, high=100_000, doc="simulator substeps a period; absent: by stability")
+    held: tuple[tuple[int, int], ...] = setting((), doc="(particle id, gripper) pairs held at the start, if fixed")
     created_by: str = setting("", doc="the command line that wrote it")
     data: tuple[str, ...] = setting((), doc="sha256 of every bag it was fitted on")
     parent: str = setting("", doc="hash of the twin this one extends")

@@ -45,7 +45,7 @@ class PredictorConfig:
     """Parameters of the predictor."""
 
     twin: str = setting("", doc="folder of the twin")
-    held: str = setting("", doc="particle:gripper pairs, e.g. '0:0 1:1'; empty: by distance to a closed gripper")
+    held: str = setting("", doc="particle:gripper pairs, e.g. '0:0 1:1'; empty: the twin's, else by distance")
     horizon: float = setting(0.0, unit="s", low=0.0, high=5.0, doc="predicted beyond the newest gripper pose")
     correct: str = setting("none", choices=("none", "tracks"), doc="open loop, or restart from every measured frame")
     max_gap: float = setting(
@@ -110,7 +110,10 @@ class PredictorNode(Shell):
         if held is not None and (unknown := sorted(set(held) - set(self._ids.tolist()))):
             raise TwinError("parameter 'held' names particles the twin does not have", got=unknown[:5])
         self._dynamics = type(self).MAKE_DYNAMICS(self._twin)
-        self._held = held
+        self._held = dict(self._twin.meta.held) or None if held is None else held
+        origin = "parameter" if held is not None else "twin"
+        told = "by distance to a closed gripper" if self._held is None else f"{self._held} ({origin})"
+        self.get_logger().info(f"held particles and their grippers: {told}")
         self._state_out = self.create_publisher(PointCloud2, STATE_POINTS, qos.points_complete())
         self._prediction_out = self.create_publisher(PointCloud2, PREDICTION_POINTS, qos.points_complete())
         self.create_service(Trigger, "~/reset", self._on_reset)

@@ -241,6 +241,8 @@ def _checked_known(known: Mapping[Any, Any] | None, source: str) -> dict[str, An
         for number in value if isinstance(value, list) else [value]:
             if isinstance(number, bool) or not isinstance(number, (int, float)) or not math.isfinite(number):
                 raise ConfigError(f"{source}: known {key}", got=repr(value), allowed="finite numbers")
+            if key in KNOWN_FACTS and number <= 0:
+                raise ConfigError(f"{source}: known {key}", got=number, allowed="above 0")
     return dict(known or {})
 
 

@@ -34,6 +34,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except PredError as error:
         print(f"pred: {error}", file=sys.stderr)
         return BAD_INPUT
+    except OSError as error:
+        where = error.filename or "a file"
+        print(f"pred: {where}: {error.strerror or error}. Give a path that can be read and written.", file=sys.stderr)
+        return BAD_INPUT
     except KeyboardInterrupt:
         print(f"pred: interrupted; {_INTERRUPTED_IN.get(name or '', _INTERRUPTED)}", file=sys.stderr)
         return INTERRUPTED

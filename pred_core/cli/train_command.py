@@ -80,6 +80,8 @@ def run(args: argparse.Namespace) -> int:
     twin.replace(residual=trainer.chosen().weights(), meta=meta).save(out)
     write_report(out, trainer.summary(), command)
     checkpoint.unlink()
+    if trainer.best_step == 0:
+        _tell("kept the first weights: no step beat the backbone on held-out recordings; train longer or use more data")
     _tell(f"wrote {out} and {out / 'train.html'}")
     return 0
 

@@ -97,6 +97,7 @@ def identify(
         object=dataset.object,
         period=stages.period,
         substeps=substeps,
+        held=tuple((dataset.held or {}).items()),
         created_by=command,
         data=hashes,
         notes=tuple(notes),
