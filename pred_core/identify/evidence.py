@@ -13,6 +13,8 @@ from pred_core.identify.sensitivity import FLOOR, knob_step, sensitivities
 from pred_core.identify.space import DISCRETE, Candidate, SearchSpace
 
 Values = dict[str, dict[str, Any]]
+NEAR = 0.95  # of the substeps allowed: as stiff as they let it be
+STIFFENS = 1.002  # a 10 % change that raises the substeps needed by more is one of those that press on the wall
 CLOSE = 1.05  # times the best loss: restarts that count for the spread
 
 
@@ -56,7 +58,8 @@ def gather_evidence(
         if knob.name not in DISCRETE:
             more = here.start()
             more[n] = knob_step(knob)
-            stiffer = problem.demand(here.candidate(more)) > max(most_substeps, 1.01 * demand)
+            # A refinement stops just short of the wall: its next step would have been refused.
+            stiffer = problem.demand(here.candidate(more)) > max(NEAR * most_substeps, STIFFENS * demand)
         shown = sensitivity >= FLOOR
         width = widths.get(knob.name) if shown else None
         spread = [end[knob.name] for end in ends if knob.name in end]
