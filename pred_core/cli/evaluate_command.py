@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pred_core.bag.dataset import Dataset, load_dataset
+from pred_core.cli.checks import warn_of_another_object
 from pred_core.errors import ConfigError
 from pred_core.evaluate.cache import PredictionCache
 from pred_core.evaluate.evaluation import EpisodeStore, Result, run_all
@@ -50,6 +51,7 @@ def run(args: argparse.Namespace) -> int:
     twins = _twins(args.twin, args.fold_twins)
     first = store.read(splits[0].folds[0].test[:1])[0]
     for named in twins:
+        warn_of_another_object(named.twin, dataset, named.name or str(args.twin[0]))
         for twin in (named.twin, *named.folds):
             check_fits(twin, first, named.name or "TWIN")
     models, optional = _models(twins, args.baselines)

@@ -17,6 +17,7 @@ from typing import Any, TypeVar, get_type_hints
 import torch
 
 from pred_core.bag.dataset import Dataset, load_dataset
+from pred_core.cli.checks import warn_of_another_object
 from pred_core.config import from_mapping
 from pred_core.errors import ConfigError
 from pred_core.pred import load_base
@@ -62,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
     network = _config(ResidualConfig, args, facts["network"] if facts else {})
     dataset = load_dataset(args.dataset)
     twin = Twin.load(args.twin).replace(residual=None)
+    warn_of_another_object(twin, dataset, str(args.twin))
     hashes = [dataset.sha256(entry) for entry in dataset.select("train")]
     source = {"twin": twin.digest(), "data": hashlib.sha256("".join(sorted(hashes)).encode()).hexdigest()}
     trainer = build_trainer(dataset, twin, training, network, args.device)
