@@ -31,7 +31,7 @@ EXTRAS = {
     "vision": ["open3d", "opencv-python-headless<5"],
     "plant": ["mujoco==4.0.0"],
     "hardware": ["ur-rtde", "xarm-python-sdk", "depthai"],
-    "dev": ["hypothesis", "mypy", "pytest", "ruff"],
+    "dev": ["hypothesis", "mcap-ros2-support", "mypy", "pytest", "ruff"],
 }
 
 
