@@ -26,6 +26,7 @@ from pred_core.twin import Twin
 from pred_core.types import Episode, Grip, ObjectInfo, Tracks
 
 SEED = 0  # of the bootstrap
+MOST_NAMED = 14  # episodes in the legend of the curves
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ def _page(scores: Sequence[LiveScore], values: dict[str, Any], model: str) -> Pa
         measured = Track("measured", shown.episode.measured[FIRST_PREDICTED:], "#1b1f24")
         predicted = Track("predicted", shown.episode.predicted[FIRST_PREDICTED:], "#d9480f")
         period = float(np.median(np.diff(shown.episode.stamps))) * 1e-9
-        title = f"{shown.episode.name}, measured and predicted"
+        title = f"{shown.episode.name}, measured and predicted."
         page.html(animation([measured, predicted], period, line=shown.episode.line, title=title))
     page.heading("Every episode")
     header = ("episode", "split", "coordinate_l1 [cm]", "mde [mm]", "chamfer_two_sided_unsquared [mm]", "lost frames")
@@ -158,6 +159,9 @@ def _curves(scores: Sequence[LiveScore]) -> Figure:
     axes = figure.subplots()
     for s in scores:
         seconds = (s.episode.stamps[FIRST_PREDICTED:] - s.episode.stamps[FIRST_PREDICTED - 1]) * 1e-9
-        axes.plot(seconds, 1e3 * s.score.curves["mde"], linewidth=0.8, alpha=0.7)
+        axes.plot(seconds, 1e3 * s.score.curves["mde"], linewidth=0.8, alpha=0.7, label=s.episode.name)
     axes.set(xlabel="time since the start [s]", ylabel="mde [mm]")
+    axes.spines[["top", "right"]].set_visible(False)
+    if len(scores) <= MOST_NAMED:
+        axes.legend(fontsize=7, ncols=2, frameon=False)
     return figure
