@@ -93,6 +93,7 @@ STRONG: dict[str, dict[str, float | tuple[float, ...]]] = {
     "rest_curvature": {"first": (1.0, -1.0) * 6, "second": (0.5,) * 12, "twist": 1.0},
     "bending_profile": {"relative": (3.0, 0.0) * 6},
     "mass_profile": {"relative": (-0.7, 1.0) * 6},
+    "stiffness_drift": {"rate": -3.0},
 }
 
 
@@ -213,8 +214,8 @@ def test_hysteresis_dissipates_at_any_speed_and_leaves_a_set(seconds: float) -> 
     for k in [*np.linspace(0, 0.3, n)[1:], *np.linspace(0.3, 0, n)[1:]]:
         step = torch.tensor(k - last)
         zero = torch.zeros(())
-        at = BendContext((torch.tensor(k), zero), (step, zero), torch.tensor(1.0), torch.tensor(1.0),
-                         torch.tensor(1e-3), torch.tensor(0.5), z)  # fmt: skip
+        at = BendContext((torch.tensor(k), zero), (step, zero), torch.tensor(1.0), torch.tensor(0.05),
+                         torch.tensor(1.0), torch.tensor(1e-3), torch.tensor(0.5), zero, z)  # fmt: skip
         m1, _, z = effect.bend(p, at)
         work += float(m1 * step)
         last = float(k)

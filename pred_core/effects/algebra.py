@@ -174,6 +174,11 @@ def maximum(a: Any, b: Any) -> Any:
     return where(a > b, a, b)
 
 
+def minimum(a: Any, b: Any) -> Any:
+    """The smaller of two scalars, per world."""
+    return where(a < b, a, b)
+
+
 def _unlaned(name: str) -> str:
     """The float inside `Lane(...)`: a place is not a lane of worlds."""
     if not (name.startswith("Lane(") and name.endswith(")")):

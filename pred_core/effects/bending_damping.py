@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pred_core.effects.effect import BendContext, Effect, Parameter
+from pred_core.types import Array
 
 
 class BendingDamping(Effect):
@@ -23,5 +24,5 @@ class BendingDamping(Effect):
         return gain * at.change[0], gain * at.change[1], ()
 
     @classmethod
-    def bend_bound(cls, p: Mapping[str, Any]) -> tuple[float, float]:
+    def bend_bound(cls, p: Mapping[str, Any], length: Array) -> tuple[float, float]:
         return 0.0, p["time"][0]

@@ -7,6 +7,7 @@ from typing import Any
 
 from pred_core.effects.algebra import sqrt
 from pred_core.effects.effect import BendContext, Effect, Parameter
+from pred_core.types import Array
 
 
 class BendingHysteresis(Effect):
@@ -38,5 +39,5 @@ class BendingHysteresis(Effect):
         return gain * z1, gain * z2, (z1, z2)
 
     @classmethod
-    def bend_bound(cls, p: Mapping[str, Any]) -> tuple[float, float]:
+    def bend_bound(cls, p: Mapping[str, Any], length: Array) -> tuple[float, float]:
         return p["ratio"][0], 0.0

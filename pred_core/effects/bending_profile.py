@@ -19,6 +19,6 @@ class BendingProfile(Effect):
     confounded_with = ("mass_profile", "rest_curvature")
 
     @classmethod
-    def bend_stiffness(cls, p: Mapping[str, Any], arc: Any) -> Any:
+    def bend_stiffness(cls, p: Mapping[str, Any], arc: Any, time: Any) -> Any:
         shape = profile(p["relative"], arc)
         return shape + 0.25 * (shape * shape)

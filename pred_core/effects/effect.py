@@ -15,6 +15,7 @@ import numpy as np
 from pred_core.effects.algebra import Vec3
 from pred_core.errors import TwinError, nearest
 from pred_core.twin import Extension
+from pred_core.types import Array
 
 HOOKS = ("boundary", "inertia", "spring", "bend", "bend_stiffness", "contact", "force", "observe")
 
@@ -43,7 +44,7 @@ class ParticleContext:
     velocity: Vec3  # [m/s] world
     mass: Any  # [kg]
     arc: Any  # material coordinate 0..1
-    time: Any  # [s] since the start of the rollout
+    time: Any  # [s] of the session: since the start, later by what `State.memory['time']` was set to
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,12 @@ class BendContext:
 
     curvature: tuple[Any, Any]  # components of the curvature binormal 2 tan(angle/2)
     change: tuple[Any, Any]  # their change since the last substep
-    weight: Any  # [N m] bending stiffness / edge length
+    weight: Any  # [N m] bending stiffness / length
+    length: Any  # [m] half of the two edges: curvature / length is the usual curvature [1/m]
     bends: Any  # number of bends of the line
     substep: Any  # [s]
     arc: Any  # material coordinate, 0..1
+    time: Any  # [s]
     memory: tuple[Any, ...]  # `bend_memory` values this effect left here in the last substep; 0 at the start
 
 
@@ -124,14 +127,15 @@ class Effect:
         raise AttributeError(f"{cls.id} has no bend hook")
 
     @classmethod
-    def bend_stiffness(cls, p: Mapping[str, Any], arc: Any) -> Any:
-        """Relative bending stiffness added, EI (1 + this), at material coordinate `arc`."""
+    def bend_stiffness(cls, p: Mapping[str, Any], arc: Any, time: Any) -> Any:
+        """Relative bending stiffness added, EI (1 + this), at material coordinate `arc` and `time` [s]."""
         raise AttributeError(f"{cls.id} has no bend_stiffness hook")
 
     @classmethod
-    def bend_bound(cls, p: Mapping[str, Any]) -> tuple[float, float]:
+    def bend_bound(cls, p: Mapping[str, Any], length: Array) -> tuple[float, float]:
         """(relative stiffness, damping time [s]) a `bend` hook adds to the weight at most; for the choice of substeps.
 
+        `length` (B,) [m] is what `BendContext` says of each bend.
         A `bend` hook's stiffness may be given as what a straight bend would need to be as stiff up to 90 degrees.
         """
         return 0.0, 0.0

@@ -8,6 +8,7 @@ from typing import Any
 
 from pred_core.effects.effect import BendContext, Effect, Parameter
 from pred_core.effects.profile import KNOTS, profile
+from pred_core.types import Array
 
 
 class RestCurvature(Effect):
@@ -37,7 +38,7 @@ class RestCurvature(Effect):
         return -(at.weight * first), -(at.weight * second), ()
 
     @classmethod
-    def bend_bound(cls, p: Mapping[str, Any]) -> tuple[float, float]:
+    def bend_bound(cls, p: Mapping[str, Any], length: Array) -> tuple[float, float]:
         # With t = tan(angle/2) and k = |k0|, the energy (EI/2l) |kb - k0|^2 bends like (1+t^2)(1+3t^2 + k t) EI/l
         # in the worst direction: 8 + 2k at 90 degrees; its slope, which turns the edges, is 4 + 2k there. Relative to
         # k = 0 both add k/2 at most. At rest, t = k/2, which may be sharper than 90 degrees, it is (1+t^2)^2.

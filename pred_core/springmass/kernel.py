@@ -79,6 +79,7 @@ class Worlds:
     frame_grip: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     memory: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     time: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
+    steps: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     clock: wp.array(dtype=wp.int32)  # type: ignore[valid-type]
     trajectory_out: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
 

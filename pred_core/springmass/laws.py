@@ -85,8 +85,8 @@ def _force(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
 
 
 def _bend_stiffness(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
-    relative = effect.bend_stiffness(p, _value(code, "Lane(e[2])"))
-    return [f"weight += bending * e[0] * {relative.name};"]
+    relative = effect.bend_stiffness(p, _value(code, "Lane(e[2])"), _value(code, "time"))
+    return [f"weight += bending * e[0] * {lane_text(relative)};"]
 
 
 def _spring(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
@@ -142,9 +142,11 @@ def _bend(code: Code, p: dict[str, Any], effect: type[Effect], slot: int) -> lis
         curvature=(_value(code, "k1"), _value(code, "k2")),
         change=(_value(code, "change1"), _value(code, "change2")),
         weight=_value(code, "weight"),
+        length=_value(code, "Lane(e[1])"),
         bends=_value(code, "line_bends"),
         substep=_value(code, "Lane(h)"),
         arc=_value(code, "Lane(e[2])"),
+        time=_value(code, "time"),
         memory=tuple(held),
     )
     first, second, memory = effect.bend(p, at)

@@ -11,10 +11,12 @@ from pred_core.effects import find_effect
 from pred_core.effects.effect import Effect
 from pred_core.errors import ConfigError
 from pred_core.springmass.stability import Added
+from pred_core.springmass.topology import bend_lengths
 from pred_core.twin import Extension
 from pred_core.types import Body, Physics
 
 PerWorld = list[tuple[Extension, ...]]
+SESSION = 300.0  # [s] of the session up to which the choice of substeps foresees a drift
 
 
 def extensions_per_world(extensions: Sequence[Extension] | Sequence[Sequence[Extension]], worlds: int) -> PerWorld:
@@ -46,18 +48,21 @@ def added_by(body: Body, extensions: Sequence[Extension]) -> Added:
     """What these effects add to the body at most, for the choice of substeps.
 
     As in the kernel: `bend_stiffness` hooks scale the weight EI/lbar, `bend` hooks multiply what they return by it.
+    Where the scale changes with time, the larger of those at the session's begin and after `SESSION` counts.
     """
-    arc = torch.as_tensor(body.arc[body.bends[:, 1]])
-    scale, stiffness, time, rate = torch.ones_like(arc), 0.0, 0.0, 0.0
+    arc, length = torch.as_tensor(body.arc[body.bends[:, 1]]), bend_lengths(body)
+    scale = torch.ones(2, len(arc), dtype=arc.dtype)
+    times = torch.tensor([[0.0], [SESSION]], dtype=arc.dtype)
+    stiffness, time, rate = 0.0, 0.0, 0.0
     for extension in extensions:
         effect = find_effect(extension.id)
         if "bend_stiffness" in effect.hooks:
-            scale = scale + effect.bend_stiffness(extension.parameters, arc)
-        more, seconds = effect.bend_bound(extension.parameters)
+            scale = scale + effect.bend_stiffness(extension.parameters, arc, times)
+        more, seconds = effect.bend_bound(extension.parameters, length)
         stiffness += more
         time += seconds
         rate += effect.rate_bound(extension.parameters)
-    return Added(scale.numpy(), stiffness, time, rate)
+    return Added(scale.amax(0).numpy(), stiffness, time, rate)
 
 
 def parameter_rows(physics: list[Physics], per_world: PerWorld, effects: tuple[type[Effect], ...]) -> Tensor:

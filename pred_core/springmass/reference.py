@@ -73,6 +73,7 @@ class Reference:
         before = Grip(memory["grip_position"].double(), memory["grip_rotation"].double(), memory["grip_closed"])
         x, v = state.position.double(), state.velocity.double()
         held, offset = state.held, memory["grip_offset"].double()
+        begun = memory["time"].double()[:, None]
         bend_memory = BendMemory()
         out, pairs = [], None
         for t in range(grips.position.shape[0]):
@@ -84,11 +85,11 @@ class Reference:
                 nexts = Grip(after.position[None], after.rotation[None], after.closed[None])
                 pairs = candidate_pairs(self.body, self.near, State(x, v, held), before, nexts, self.period).long()
             for sub in range(self.substeps):
-                time = torch.full_like(self.stiffness, (t * self.substeps + sub) * h)
+                time = begun + (t * self.substeps + sub) * h
                 alpha = sub / self.substeps
                 rotation = quaternion_normalize((1 - alpha) * before.rotation + alpha * after.rotation)
                 force = self.spring_forces(x, v, time)
-                force = force + bend_forces(self, x, held, rotation, h, bend_memory)
+                force = force + bend_forces(self, x, held, rotation, time, h, bend_memory)
                 if pairs is not None:
                     force = force + self.pair_forces(x, v, pairs, h)
                 x, v = self.integrate(x, v, force, before, after, alpha, time, h)

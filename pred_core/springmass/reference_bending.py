@@ -27,7 +27,9 @@ class BendMemory:
     effects: dict[int, tuple[Tensor, ...]] = field(default_factory=dict)  # per effect, (W, B) each
 
 
-def bend_forces(sim: Reference, x: Tensor, held: Tensor, rotation: Tensor, h: float, memory: BendMemory) -> Tensor:
+def bend_forces(
+    sim: Reference, x: Tensor, held: Tensor, rotation: Tensor, time: Tensor, h: float, memory: BendMemory
+) -> Tensor:
     """(W, N, 3) [N]: minus the gradient of EI/(2 lbar) |kb|^2, and the moments that effects add."""
     force = torch.zeros_like(x)
     if not sim.lines:
@@ -37,11 +39,11 @@ def bend_forces(sim: Reference, x: Tensor, held: Tensor, rotation: Tensor, h: fl
     length_a, length_b = a.norm(dim=-1, keepdim=True), b.norm(dim=-1, keepdim=True)
     a, b = a / length_a, b / length_b
     q = 1.0 / (1.0 + _dot(a, b)).clamp_min(FOLD)
-    weight = sim.bending * sim.bend_rows[:, 0] * (1.0 + _relative_stiffness(sim))
+    weight = sim.bending * sim.bend_rows[:, 0] * (1.0 + _relative_stiffness(sim, time))
     alpha = -4.0 * weight[..., None] * q * q
     along_a, along_b = alpha * b, alpha * a
     if sim.hooks("bend"):
-        first, second, directors = _moments(sim, x, held, rotation, h, memory, a, b, q, weight)
+        first, second, directors = _moments(sim, x, held, rotation, time, h, memory, a, b, q, weight)
         moment = first[..., None] * directors[0] + second[..., None] * directors[1]
         triple = _dot(torch.linalg.cross(a, b), moment)
         along_a = along_a + 2.0 * q * (torch.linalg.cross(b, moment) - triple * q * b)
@@ -52,8 +54,8 @@ def bend_forces(sim: Reference, x: Tensor, held: Tensor, rotation: Tensor, h: fl
 
 
 def _moments(
-    sim: Reference, x: Tensor, held: Tensor, rotation: Tensor, h: float, memory: BendMemory, a: Tensor, b: Tensor,
-    q: Tensor, weight: Tensor,
+    sim: Reference, x: Tensor, held: Tensor, rotation: Tensor, time: Tensor, h: float, memory: BendMemory, a: Tensor,
+    b: Tensor, q: Tensor, weight: Tensor,
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:  # fmt: skip
     """Moments (W, B) along the two directors of each bend, and the directors (W, B, 3)."""
     bends = sim.body.bends
@@ -75,19 +77,19 @@ def _moments(
     for number, (effect, p) in enumerate(sim.hooks("bend")):
         kept = memory.effects.get(number, (torch.zeros_like(weight),) * effect.bend_memory)
         at = BendContext(
-            (now[..., 0], now[..., 1]), (change[..., 0], change[..., 1]), weight, counts,
-            torch.tensor(h, dtype=x.dtype), sim.bend_rows[:, 2][None], kept,
+            (now[..., 0], now[..., 1]), (change[..., 0], change[..., 1]), weight, sim.bend_rows[:, 1][None],
+            counts, torch.tensor(h, dtype=x.dtype), sim.bend_rows[:, 2][None], time, kept,
         )  # fmt: skip
         m1, m2, memory.effects[number] = effect.bend(p, at)
         first, second = first + m1, second + m2
     return first, second, (d1, d2)
 
 
-def _relative_stiffness(sim: Reference) -> Tensor:
+def _relative_stiffness(sim: Reference, time: Tensor) -> Tensor:
     """(1, 1) or (W, B): relative bending stiffness that effects add."""
     total = torch.zeros(1, 1, dtype=torch.float64)
     for effect, p in sim.hooks("bend_stiffness"):
-        total = total + effect.bend_stiffness(p, sim.bend_rows[:, 2][None])
+        total = total + effect.bend_stiffness(p, sim.bend_rows[:, 2][None], time)
     return total
 
 

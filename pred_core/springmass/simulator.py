@@ -81,7 +81,10 @@ class SpringMass:
         self._workspaces: dict[Size, tuple[Workspace, Tensor, Tensor]] = {}
 
     def start(self, state: State, grip: Grip | None = None) -> State:
-        """Fill in grip offsets, the pose they refer to, effect memory and the clock. See `Dynamics.start`."""
+        """Fill in grip offsets, the pose they refer to, effect memory and the clock. See `Dynamics.start`.
+
+        For causes that change over a session, set `memory["time"]` (W,) [s] to when in the session the rollout begins.
+        """
         flat, lead = self._flatten(state)
         count = flat.position.shape[0]
         if grip is None:
@@ -98,6 +101,7 @@ class SpringMass:
             "grip_offset": grasp.grip_offsets(flat.position, flat.held, grip),
             "effects": torch.zeros(count, self._memory_size, device=self.device),
             "time": torch.zeros(count, device=self.device),
+            "steps": torch.zeros(count, device=self.device),
         }
         return _unflatten(flat.replace(memory=memory), lead)
 
@@ -158,6 +162,7 @@ class SpringMass:
             pack_into(tensors["grips"], _poses(before, grips))
         if self.effects:
             pack_into(tensors["time"], memory["time"])
+            pack_into(tensors["steps"], memory["steps"])
         if self._memory_size:
             pack_into(tensors["memory"], memory["effects"])
         if self._near is not None:
@@ -170,7 +175,7 @@ class SpringMass:
         memory["grip_closed"] = grips.closed[-1]
         if self._memory_size:
             memory["effects"] = unpack(tensors["memory"], worlds)
-        memory["time"] = memory["time"] + grips.position.shape[0] * self.period
+        memory["steps"] = memory["steps"] + grips.position.shape[0]
         position, velocity = unpack(work.position, worlds), unpack(work.velocity, worlds)
         trajectory = tensors["trajectory_out"][:, :worlds].clone() if record else position
         return State(position, velocity, state.held, memory), trajectory

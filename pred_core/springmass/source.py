@@ -61,7 +61,8 @@ PRELUDE = r"""
   Lane* held_lever = (Lane*)w.held_lever.data + (size_t)block * H * 3;
   const Lane* grips = (const Lane*)w.grips.data + (size_t)block * (T + 1) * G * 8;  // (T+1, G, 8) p, q wxyz, closed
   float* out = (float*)w.trajectory_out.data;  // (T, worlds, N, 3)
-  const Lane start_time = ((const Lane*)w.time.data)[block];
+  const Lane start_time = ((const Lane*)w.time.data)[block];  // [s] of the session, when the rollout began
+  const Lane steps = ((const Lane*)w.steps.data)[block];      // periods since; counted, so that calls add up exactly
   const Lane stiffness = P[0], damping = P[1], friction = P[2], bending = P[3];
 
   // CPU: one thread adds. CUDA: springs of one particle run at the same time.
@@ -72,7 +73,9 @@ PRELUDE = r"""
     *target += value;
 #endif
   };
-  auto clock = [&](int period, int sub) -> Lane { return start_time + ((float)period * m.substeps + sub) * h; };
+  auto clock = [&](int period, int sub) -> Lane {
+    return start_time + ((steps + (float)period) * m.substeps + sub) * h;
+  };
   auto record = [&](int period, int k) {  // one coordinate of every lane
     const Lane value = X[D * (k / 3) + k % 3];
     const float* lane = (const float*)&value;

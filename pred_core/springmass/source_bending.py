@@ -199,6 +199,6 @@ FRAMED_LINE = r"""
         start_frame(line, period, alpha);
         for (int b = chains[2 * line]; b < chains[2 * line + 1]; ++b) bend_force(b, time);
 """
-FRESH = "fresh = period == 0 && sub == 0 ? lane_select(start_time > zero, zero, one) : zero;"
+FRESH = "fresh = period == 0 && sub == 0 ? lane_select(steps > zero, zero, one) : zero;"
 ALL_BENDS_FRAMED = FRESH + " for (int line = 0; line < K; ++line) {" + FRAMED_LINE + "      }"
 ONE_BEND_FRAMED = FRESH + " if (element < K) { const int line = element;" + FRAMED_LINE + "    }"

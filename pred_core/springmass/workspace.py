@@ -45,6 +45,7 @@ class Workspace:
             "frame_grip": (blocks, lines, 2, lanes),
             "memory": (blocks, memory, lanes),
             "time": (blocks, lanes),
+            "steps": (blocks, lanes),
             "trajectory_out": (size.periods, blocks * lanes, particles, 3),
         }
         self.tensors = {name: torch.zeros(shape, device=device) for name, shape in shapes.items()}
