@@ -1,0 +1,22 @@
+"""Friction of another size than identified."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pred_core.effects.effect import ContactContext, Effect, Parameter
+
+
+class FrictionScale(Effect):
+    """mu -> mu (1 + a): another surface, or dust, or moisture."""
+
+    id = "friction_scale"
+    family = "friction"
+    hooks = ("contact",)
+    parameters = (Parameter("change", "1", -1.0, 10.0, typical=0.3, doc="a, relative change of the coefficient"),)
+    confounded_with = ("friction_viscous", "friction_anisotropic", "friction_drift", "friction_patch")
+
+    @classmethod
+    def contact(cls, p: Mapping[str, Any], at: ContactContext) -> tuple[Any, Any]:
+        return at.friction * p["change"][0], 0.0
