@@ -61,3 +61,18 @@ def rotation_about_z(angle: Tensor) -> Tensor:
     zero, one = torch.zeros_like(c), torch.ones_like(c)
     rows = torch.stack((c, -s, zero, s, c, zero, zero, zero, one), dim=-1)
     return rows.reshape(*angle.shape, 3, 3)
+
+
+def quaternion_to_rotation_vector(q: Tensor) -> Tensor:
+    """Logarithm: unit quaternion (..., 4) wxyz to the rotation vector (..., 3) [rad] of at most pi."""
+    q = torch.where(q[..., :1] < 0.0, -q, q)
+    sine = q[..., 1:].norm(dim=-1, keepdim=True)
+    angle = 2.0 * torch.atan2(sine, q[..., :1])
+    # a / sin(a/2), with its limit 2 at a = 0.
+    return q[..., 1:] * torch.where(sine > 1e-8, angle / sine.clamp_min(1e-8), torch.full_like(sine, 2.0))
+
+
+def quaternion_slerp(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
+    """Unit quaternions between a (weight 0) and b (weight 1), (..., 4) wxyz, the short way round. weight (...)."""
+    turn = quaternion_to_rotation_vector(quaternion_multiply(quaternion_conjugate(a), b))
+    return quaternion_multiply(a, quaternion_from_rotation_vector(weight.unsqueeze(-1) * turn))

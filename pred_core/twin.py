@@ -2,6 +2,7 @@
 
     body.npz                the static object (`Body`)
     physics.yaml            identified scalars (`Physics`), with unit, spread and sensitivity beside each
+    calibration.yaml        what sensors and the gripper's pose get wrong, corrected where data enter; absent: nothing
     extensions.yaml         effects that the diagnosis or a user added, by id, with parameters and evidence
     residual.safetensors    network weights, if trained; configuration in its metadata
     twin.yaml               versions, period, scene, hashes of data and parents
@@ -25,6 +26,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from pred_core.calibration import Calibration, calibration_to_mapping, calibration_values
 from pred_core.config import from_mapping, load_yaml, setting, to_mapping
 from pred_core.errors import TwinError
 from pred_core.types import Body, Box, Capsule, Fixture, ObjectInfo, Physics, Scene, Sphere
@@ -60,6 +62,9 @@ class TwinMeta:
     period: float = setting(0.01, unit="s", low=1e-4, high=1.0, doc="time one step covers")
     substeps: int | None = setting(None, low=1, high=100_000, doc="simulator substeps a period; absent: by stability")
     held: tuple[tuple[int, int], ...] = setting((), doc="(particle id, gripper) pairs held at the start, if fixed")
+    levers: tuple[tuple[int, tuple[float, float, float]], ...] = setting(
+        (), unit="m", doc="(particle id, mean place in its gripper's frame) of particles that were held"
+    )
     created_by: str = setting("", doc="the command line that wrote it")
     data: tuple[str, ...] = setting((), doc="sha256 of every bag it was fitted on")
     parent: str = setting("", doc="hash of the twin this one extends")
@@ -78,6 +83,7 @@ class Twin:
     residual: ResidualWeights | None = None
     physics_report: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # per parameter: spread, ...
     base: Twin | None = None  # the plainer twin this one extends
+    calibration: Calibration = Calibration()  # of the data this twin is used on
 
     def replace(self, **changes: Any) -> Twin:
         """A copy with some fields changed."""
@@ -110,6 +116,10 @@ class Twin:
                 for e in self.extensions
             ],
         )
+        if self.calibration.identity:
+            (path / "calibration.yaml").unlink(missing_ok=True)
+        else:
+            _write_yaml(path / "calibration.yaml", calibration_to_mapping(self.calibration))
         meta = to_mapping(self.meta)
         meta["scene"] = _scene_to_mapping(self.scene)
         _write_yaml(path / "twin.yaml", meta)
@@ -157,6 +167,7 @@ class Twin:
             residual=_load_residual(path / "residual.safetensors"),
             physics_report=report,
             base=cls.load(path / "base") if (path / "base").is_dir() else None,
+            calibration=_load_calibration(path / "calibration.yaml"),
         )
 
     def digest(self) -> str:
@@ -166,6 +177,8 @@ class Twin:
             sha.update(np.ascontiguousarray(getattr(self.body, f.name)).tobytes())
         extensions = [(e.id, e.version, sorted(e.parameters.items())) for e in self.extensions]
         sha.update(repr((self.physics, self.scene, extensions, self.meta.period, self.meta.substeps)).encode())
+        if not self.calibration.identity:
+            sha.update(repr(self.calibration).encode())
         if self.residual is not None:
             for key in sorted(self.residual.tensors):
                 sha.update(self.residual.tensors[key].detach().cpu().contiguous().numpy().tobytes())
@@ -208,6 +221,12 @@ def _load_extensions(path: Path) -> tuple[Extension, ...]:
         )
     except (TypeError, KeyError, ValueError, AttributeError) as error:
         raise TwinError(f"{path}: malformed entry", got=error, allowed="id, version, parameters, evidence") from error
+
+
+def _load_calibration(path: Path) -> Calibration:
+    if not path.is_file():
+        return Calibration()
+    return from_mapping(Calibration, calibration_values(load_yaml(path) or {}, str(path)), str(path))
 
 
 def _load_residual(path: Path) -> ResidualWeights | None:

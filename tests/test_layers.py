@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 
 LEVEL = {
     **dict.fromkeys(("frames", "config", "errors"), 0),
-    **dict.fromkeys(("types", "dynamics", "twin"), 1),
+    **dict.fromkeys(("types", "dynamics", "calibration", "twin"), 1),
     **dict.fromkeys(("springmass", "effects", "residual", "track", "render", "arm", "metrics", "bag", "report"), 2),
     **dict.fromkeys(("pred", "baselines"), 3),
     **dict.fromkeys(("identify", "train", "diagnose", "plan", "evaluate", "live"), 4),

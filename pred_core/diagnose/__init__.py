@@ -1,0 +1,1 @@
+"""Which causes the simulation lacks: found, named, added, measured."""

@@ -1,0 +1,68 @@
+"""Table height and tilt as causes: against the reference's table, else against the twin's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pred_core.diagnose.gate_result import GateCause
+from pred_core.diagnose.gate_select import LEVEL
+from pred_core.diagnose.gate_table import compare, fit_plane
+from pred_core.types import Episode
+
+TABLE_CAUSES = ("table_height", "table_tilt")
+SMALLEST_CHANGE = 5e-4  # [m] against a reference
+SMALLEST_ABSOLUTE = 2e-3  # [m] against the twin's plane: the particles' radius is not known better
+LONG_ENOUGH = 0.05  # [m] deviation of the resting points along an axis from which on a tilt shows
+
+
+def table_causes(
+    suspect: Sequence[Episode],
+    reference: Sequence[Episode],
+    ground: float | None,
+    radius: float,
+    sigma: float,
+    family: int,
+) -> list[GateCause]:
+    """Height [m] and slope of the plane that particles rest on, as changes. family: tests that Holm corrects for."""
+    before = fit_plane(reference, sigma) if reference else None
+    plane = fit_plane(suspect, sigma, None if before is None else before.middle)
+    if plane is None or (reference and before is None):
+        return [GateCause(i, False, False, "too few particles rest on one plane while the gripper moves")
+                for i in TABLE_CAUSES]  # fmt: skip
+    if before is None and ground is None:
+        why = f"the twin has no table; particles rest at {1e3 * plane.value[0]:.1f} mm"
+        return [GateCause(i, False, False, why) for i in TABLE_CAUSES]
+    expected = np.array([(ground or 0.0) + radius, 0.0, 0.0]) if before is None else before.value
+    covariance = plane.covariance if before is None else plane.covariance + before.covariance
+    freedom = plane.episodes - 1 + (0 if before is None else before.episodes - 1)
+    value = plane.value - expected
+    smallest = SMALLEST_ABSOLUTE if before is None else max(SMALLEST_CHANGE, 0.5 * sigma)
+    causes = []
+    for id, part, name, unit in (
+        ("table_height", slice(0, 1), "height", "m"),
+        ("table_tilt", slice(1, 3), "slope", "1"),
+    ):
+        p, margin = compare(value, covariance, part, freedom)
+        own = value[part]
+        size = float(np.abs(own[0])) if id == "table_height" else float(np.linalg.norm(own * plane.extent))
+        testable = id == "table_height" or bool((plane.extent >= LONG_ENOUGH).all())
+        accepted = testable and min(1.0, family * p) <= LEVEL and size >= smallest
+        causes.append(
+            GateCause(
+                id=id,
+                accepted=accepted,
+                testable=testable,
+                why=f"particles rest in {plane.episodes} episodes, at {1e3 * plane.value[0]:.2f} mm"
+                + ("" if before is None else f", in the reference at {1e3 * before.value[0]:.2f} mm")
+                + ("" if testable else "; they rest along one direction only"),
+                unit=unit,
+                parameters={name: tuple(map(float, own))},
+                interval={name: tuple((float(a), float(b)) for a, b in zip(own - margin, own + margin, strict=True))},
+                p_value=p,
+                p_adjusted=min(1.0, family * p),
+                effect_mm=1e3 * size,
+            )
+        )
+    return causes
