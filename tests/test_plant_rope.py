@@ -72,7 +72,7 @@ def test_a_limp_rope_between_two_nails_is_a_catenary() -> None:
 
 
 def test_the_rope_feels_its_inertia_and_swings_with_its_own_period() -> None:
-    """A hanging chain: w = 1.2024 sqrt(g / L) (half the first zero of J0), L = 0.65625 m below the jaws: 1.351 s."""
+    """A hanging chain: w = 1.2024 sqrt(g / L) (half the first zero of J0), L = 0.678125 m below the jaws: 1.374 s."""
     rope = build_rope(RopeConfig(bending=1e-6, damping=0.0, armature=1e-9))
     world = World(rope)
     motion = still()
@@ -86,7 +86,7 @@ def test_the_rope_feels_its_inertia_and_swings_with_its_own_period() -> None:
         tip[k] = world.material_points(np.array([0.7]))[0, 0] - motion.home[0]
     spectrum = np.abs(np.fft.rfft((tip - tip.mean()) * np.hanning(len(tip)), 16 * len(tip)))
     period = 16 * len(tip) * STEP / spectrum.argmax()
-    assert period == pytest.approx(1.351, rel=0.02)
+    assert period == pytest.approx(1.374, rel=0.02)
 
 
 @pytest.mark.parametrize("regime", ["air", "table"])
@@ -100,7 +100,8 @@ def test_the_gripper_is_where_it_was_told_to_be_whatever_it_carries(regime: str,
     w, x, y, z = q.T
     down = -np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
     assert record.position[:, 0] == pytest.approx(place, abs=1e-9)
-    assert record.position[:, 1] == pytest.approx(place + 0.7 / 29 * down, abs=1e-9)
+    # The jaws end after 21.9 mm: the last 2.2 mm turn with the rope, by less than 45 degrees.
+    assert np.linalg.norm(record.position[:, 1] - place - 0.7 / 29 * down, axis=-1).max() < 2 * 2.3e-3 * np.sin(np.pi / 8)
 
 
 def test_a_seed_gives_the_same_run_bit_for_bit(monkeypatch) -> None:

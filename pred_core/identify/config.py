@@ -32,8 +32,14 @@ class IdentifyConfig:
     stride: int = setting(5, low=1, high=1000, doc="frames between the residuals the refinement reads")
     estimate_starts: bool = setting(True, doc="fit starts over several frames instead of two")
     hold_out: float = setting(0.2, low=0.0, high=0.9, doc="share of the train recordings kept for the check")
-    substeps: int = setting(20, low=1, high=20_000, doc="most substeps a period; bounds stiffness")
+    substeps: int | None = setting(
+        None, low=1, high=20_000, doc="most substeps a period; bounds stiffness; absent: a substep of 0.5 ms"
+    )
     mass: float = setting(0.1, unit="kg", low=1e-6, high=1e4, doc="total mass where the data set knows none (nominal)")
-    ground: float | None = setting(None, unit="m", doc="height of the table; absent: nothing is touched")
-    radius: float = setting(0.0, unit="m", low=0.0, high=1.0, doc="particle radius in contact")
+    ground: float | None = setting(
+        None, unit="m", doc="height of the table; absent: what the data set knows, else nothing is touched"
+    )
+    radius: float | None = setting(
+        None, unit="m", low=0.0, high=1.0, doc="particle radius in contact; absent: what the data set knows, else 0"
+    )
     seed: int = setting(0, low=0, high=2**31 - 1, doc="of windows, hold-out and searches")

@@ -91,7 +91,7 @@ def identify(
     # What keeps it stable whatever the motion, also where the refinement was simulated with fewer.
     substeps = max(1, math.ceil(problem.demand(best)))
     losses = problem.losses([best], substeps)[0]
-    wall = config.substeps * (1.0 if refined is None else ROOM)
+    wall = stages.most_substeps * (1.0 if refined is None else ROOM)
     values = gather_evidence(problem, space, searched, best, restarts, wall)
     meta = TwinMeta(
         object=dataset.object,

@@ -27,6 +27,7 @@ MOST_WINDOWS = 112  # of a refinement stage shorter than an episode
 # Substeps are chosen at half the stability limit. A search that ends there may be refined beyond, still stable: at the
 # wall every small step would be charged and nothing could move.
 ROOM = 1.7
+SUBSTEP = 5e-4  # [s] the shortest of a search unless the user says otherwise
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,13 @@ class Stages:
         most = count or max(MOST_WINDOWS, len(recordings))
         index = draw_windows(recordings, steps, most, torch.Generator().manual_seed(self.config.seed))
         windows = make_windows(recordings, index, steps, self.period, self.noise)
-        bound = most_substeps or self.config.substeps
+        bound = most_substeps or self.most_substeps
         return Problem(body or self.layout.body, self.layout.scene, self.period, windows, bound, topology, room)
+
+    @property
+    def most_substeps(self) -> int:
+        """Substeps a period at most."""
+        return self.config.substeps or max(1, round(self.period / SUBSTEP))
 
     def whole(self, recordings: Sequence[Recording]) -> Problem:
         """The longest windows, with all springs that were searched and no bound on stiffness: to judge with."""

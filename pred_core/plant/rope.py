@@ -34,7 +34,7 @@ class RopeConfig:
     length: float = setting(0.7, unit="m", low=0.05, high=5.0, doc="from end to end")
     mass: float = setting(0.05, unit="kg", low=1e-4, high=10.0, doc="of the whole rope")
     links: int = setting(32, low=4, high=200, doc="capsules")
-    clamped: int = setting(2, low=1, high=8, doc="links in the jaws")
+    clamped: int = setting(1, low=1, high=8, doc="links in the jaws; the first two tracked points sit in them")
     radius: float = setting(0.004, unit="m", low=5e-4, high=0.05, doc="of the capsules")
     bending: float = setting(3e-4, unit="N m^2", low=1e-6, high=1.0, doc="EI: a joint's spring is EI / link length")
     damping: float = setting(0.02, unit="s", low=0.0, high=1.0, doc="a joint's damper over its spring")

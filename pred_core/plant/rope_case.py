@@ -59,7 +59,7 @@ def write_rope_case(
         session=session,
         sensor=sensor,
         seed=seed,
-        known={"mass": rope.mass, "rest_length": rope.length},
+        known={"mass": rope.mass, "rest_length": rope.length, "radius": rope.radius, "ground": 0.0},
         progress=progress,
     )
 

@@ -94,7 +94,7 @@ def write_springs_case(
         session=session,
         sensor=sensor,
         seed=seed,
-        known={"mass": springs.mass, "rest_length": springs.length},
+        known={"mass": springs.mass, "rest_length": springs.length, "ground": 0.0},
         progress=progress,
     )
 
