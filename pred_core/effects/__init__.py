@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pred_core.effects.attraction import Attraction
+from pred_core.effects.bending_creep import BendingCreep
 from pred_core.effects.bending_damping import BendingDamping
 from pred_core.effects.bending_gradient import BendingGradient
 from pred_core.effects.bending_hysteresis import BendingHysteresis
+from pred_core.effects.bending_plasticity import BendingPlasticity
 from pred_core.effects.bending_profile import BendingProfile
 from pred_core.effects.bending_region import BendingRegion
 from pred_core.effects.bending_scale import BendingScale
+from pred_core.effects.bending_stiffening import BendingStiffening
 from pred_core.effects.drag_linear import DragLinear
 from pred_core.effects.drag_quadratic import DragQuadratic
 from pred_core.effects.effect import Effect
@@ -23,7 +26,9 @@ from pred_core.effects.length_scale import LengthScale
 from pred_core.effects.mass_gradient import MassGradient
 from pred_core.effects.mass_profile import MassProfile
 from pred_core.effects.obstacle import Obstacle
+from pred_core.effects.rest_bow import RestBow
 from pred_core.effects.rest_curvature import RestCurvature
+from pred_core.effects.stiffness_drift import StiffnessDrift
 from pred_core.effects.strain_stiffening import StrainStiffening
 from pred_core.effects.stretch_scale import StretchScale
 from pred_core.effects.table_height import TableHeight
@@ -62,6 +67,11 @@ _ALL: tuple[type[Effect], ...] = (
     StretchScale,
     LengthDrift,
     LengthScale,
+    StiffnessDrift,
+    BendingCreep,
+    RestBow,
+    BendingStiffening,
+    BendingPlasticity,
 )
 LIBRARY: dict[str, type[Effect]] = {e.id: e for e in _ALL}
 

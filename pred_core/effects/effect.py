@@ -17,7 +17,7 @@ from pred_core.errors import TwinError, nearest
 from pred_core.twin import Extension
 from pred_core.types import Array
 
-HOOKS = ("boundary", "inertia", "spring", "bend", "bend_stiffness", "contact", "force", "observe")
+HOOKS = ("boundary", "inertia", "spring", "bend", "rest_shape", "bend_stiffness", "contact", "force", "observe")
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,7 @@ class BendContext:
     arc: Any  # material coordinate, 0..1
     time: Any  # [s]
     memory: tuple[Any, ...]  # `bend_memory` values this effect left here in the last substep; 0 at the start
+    rest: tuple[Any, Any] = (0.0, 0.0)  # what other effects' `rest_shape` say, for effects that have one
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,14 @@ class Effect:
     def bend(cls, p: Mapping[str, Any], at: BendContext) -> tuple[Any, Any, tuple[Any, ...]]:
         """(moment, moment) [N m] added along the two material axes, and the new memory."""
         raise AttributeError(f"{cls.id} has no bend hook")
+
+    @classmethod
+    def rest_shape(cls, p: Mapping[str, Any], at: BendContext) -> tuple[Any, Any]:
+        """Components of the curvature at which this effect's moment and the elastic one balance.
+
+        Adds nothing by itself: it lets laws that change the rest shape see the elastic part of a curvature.
+        """
+        raise AttributeError(f"{cls.id} has no rest_shape hook")
 
     @classmethod
     def bend_stiffness(cls, p: Mapping[str, Any], arc: Any, time: Any) -> Any:

@@ -20,7 +20,7 @@ class RestCurvature(Effect):
 
     id = "rest_curvature"
     family = "bending"
-    hooks = ("bend",)
+    hooks = ("bend", "rest_shape")
     parameters = (
         Parameter("first", "1", -5.0, 5.0, size=KNOTS, typical=0.2, doc="k0 along the first axis, at knots"),
         Parameter("second", "1", -5.0, 5.0, size=KNOTS, typical=0.2, doc="k0 along the second axis, at knots"),
@@ -34,8 +34,12 @@ class RestCurvature(Effect):
 
     @classmethod
     def bend(cls, p: Mapping[str, Any], at: BendContext) -> tuple[Any, Any, tuple[Any, ...]]:
-        first, second = profile(p["first"], at.arc), profile(p["second"], at.arc)
+        first, second = cls.rest_shape(p, at)
         return -(at.weight * first), -(at.weight * second), ()
+
+    @classmethod
+    def rest_shape(cls, p: Mapping[str, Any], at: BendContext) -> tuple[Any, Any]:
+        return profile(p["first"], at.arc), profile(p["second"], at.arc)
 
     @classmethod
     def bend_bound(cls, p: Mapping[str, Any], length: Array) -> tuple[float, float]:

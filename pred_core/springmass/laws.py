@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from pred_core.effects.algebra import Code, Traced, Vec3, lane_text
@@ -27,20 +28,15 @@ def law_statements(effects: tuple[type[Effect], ...]) -> dict[str, str]:
         "bend_stiffness": ("@BEND_STIFFNESS@", _bend_stiffness),
     }
     parts: dict[str, list[str]] = {placeholder: [] for placeholder, _ in writers.values()}
-    parts["@BEND@"] = []
-    row, slot = BASE_PARAMETERS, 0
+    row = BASE_PARAMETERS
     for number, effect in enumerate(effects):
         for hook, (placeholder, write) in writers.items():
             if hook in effect.hooks:
                 code = Code(f"{hook}{number}_")
                 tail = write(code, _parameters(code, effect, row), effect)
                 parts[placeholder] += [*code.lines, *tail]
-        if "bend" in effect.hooks:
-            code = Code(f"bend{number}_")
-            tail = _bend(code, _parameters(code, effect, row), effect, slot)
-            parts["@BEND@"] += [*code.lines, *tail]
-            slot += effect.bend_memory
         row += sum(q.size for q in effect.parameters)
+    parts["@BEND@"] = _bends(effects)
     return {placeholder: "\n    ".join(lines) for placeholder, lines in parts.items()}
 
 
@@ -134,10 +130,29 @@ def _boundary(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
     return [f"r{k} += {lane_text(v)};" for k, v in zip("xyz", (d.x, d.y, d.z), strict=True)]
 
 
-def _bend(code: Code, p: dict[str, Any], effect: type[Effect], slot: int) -> list[str]:
-    """Moments along the directors; an effect's memory slots follow the two of the curvature."""
-    places = [f"memory[4 * K + (2 + {slot + k}) * B + b]" for k in range(effect.bend_memory)]
-    held = [code.emit(f"lane_select(fresh > zero, zero, {place})") for place in places]
+def _bends(effects: tuple[type[Effect], ...]) -> list[str]:
+    """Moments along the directors; effects' memory slots follow the two of the curvature and are all read first."""
+    kept, laws, slot = [], [], 0
+    for number, effect in enumerate(effects):
+        places = [f"memory[4 * K + (2 + {slot + k}) * B + b]" for k in range(effect.bend_memory)]
+        kept += [f"const Lane kept{number}_{k} = lane_select(fresh > zero, zero, {p});" for k, p in enumerate(places)]
+        slot += effect.bend_memory
+        if "bend" in effect.hooks:
+            code = Code(f"bend{number}_")
+            p, at = _bend(code, effects, number)
+            if "rest_shape" in effect.hooks:
+                others = [n for n, e in enumerate(effects) if n != number and "rest_shape" in e.hooks]
+                shapes = [effects[n].rest_shape(*_bend(code, effects, n)) for n in others]
+                at = replace(at, rest=(sum((s[0] for s in shapes), 0.0), sum((s[1] for s in shapes), 0.0)))
+            first, second, memory = effect.bend(p, at)
+            laws += [*code.lines, f"moment1 += {lane_text(first)}; moment2 += {lane_text(second)};"]
+            laws += [f"{place} = {lane_text(value)};" for place, value in zip(places, memory, strict=True)]
+    return kept + laws
+
+
+def _bend(code: Code, effects: tuple[type[Effect], ...], number: int) -> tuple[dict[str, Any], BendContext]:
+    """Parameters and context of one effect's bend hooks."""
+    row = BASE_PARAMETERS + sum(q.size for e in effects[:number] for q in e.parameters)
     at = BendContext(
         curvature=(_value(code, "k1"), _value(code, "k2")),
         change=(_value(code, "change1"), _value(code, "change2")),
@@ -147,8 +162,6 @@ def _bend(code: Code, p: dict[str, Any], effect: type[Effect], slot: int) -> lis
         substep=_value(code, "Lane(h)"),
         arc=_value(code, "Lane(e[2])"),
         time=_value(code, "time"),
-        memory=tuple(held),
+        memory=tuple(_value(code, f"kept{number}_{k}") for k in range(effects[number].bend_memory)),
     )
-    first, second, memory = effect.bend(p, at)
-    kept = [f"{place} = {lane_text(value)};" for place, value in zip(places, memory, strict=True)]
-    return [f"moment1 += {lane_text(first)}; moment2 += {lane_text(second)};", *kept]
+    return _parameters(code, effects[number], row), at

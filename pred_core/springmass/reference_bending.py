@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -74,13 +74,22 @@ def _moments(
     memory.curvature = now
     counts = torch.cat([torch.full((e - s,), float(e - s), dtype=x.dtype) for s, e in sim.lines])[None]
     first, second = torch.zeros_like(weight), torch.zeros_like(weight)
-    for number, (effect, p) in enumerate(sim.hooks("bend")):
+    benders = sim.hooks("bend")
+    contexts = []
+    for number, (effect, _) in enumerate(benders):
         kept = memory.effects.get(number, (torch.zeros_like(weight),) * effect.bend_memory)
         at = BendContext(
             (now[..., 0], now[..., 1]), (change[..., 0], change[..., 1]), weight, sim.bend_rows[:, 1][None],
             counts, torch.tensor(h, dtype=x.dtype), sim.bend_rows[:, 2][None], time, kept,
         )  # fmt: skip
-        m1, m2, memory.effects[number] = effect.bend(p, at)
+        contexts.append(at)
+    shapes = {
+        n: effect.rest_shape(p, contexts[n]) for n, (effect, p) in enumerate(benders) if "rest_shape" in effect.hooks
+    }
+    for number, (effect, p) in enumerate(benders):
+        others = [shape for n, shape in shapes.items() if n != number and number in shapes]
+        rest = sum((s[0] for s in others), 0.0), sum((s[1] for s in others), 0.0)
+        m1, m2, memory.effects[number] = effect.bend(p, replace(contexts[number], rest=rest))
         first, second = first + m1, second + m2
     return first, second, (d1, d2)
 
