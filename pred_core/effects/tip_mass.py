@@ -8,11 +8,11 @@ from typing import Any
 from pred_core.effects.algebra import where
 from pred_core.effects.effect import Effect, Parameter
 
-BEGIN, END = 0.89, 0.91  # material coordinates between which the tip begins
+EDGE = 1.0 / 29.0  # of the ramp in material coordinate: what a particle of a line of 30 stands for
 
 
 class TipMass(Effect):
-    """m -> m (1 + a) on the last tenth, arc > 0.9; the edge is a smooth step over 0.02."""
+    """m -> m (1 + a) on the last tenth, arc > 0.9, whose edge is a ramp as wide as a particle."""
 
     id = "tip_mass"
     family = "mass"
@@ -22,6 +22,6 @@ class TipMass(Effect):
 
     @classmethod
     def inertia(cls, p: Mapping[str, Any], arc: Any) -> Any:
-        u = (arc - BEGIN) / (END - BEGIN)
-        step = where(u < 0.0, 0.0 * u, where(u > 1.0, 0.0 * u + 1.0, u * u * (3.0 - 2.0 * u)))
+        ramp = (arc - 0.9) / EDGE + 0.5
+        step = where(ramp < 0.0, 0.0 * ramp, where(ramp > 1.0, 0.0 * ramp + 1.0, ramp))
         return p["change"][0] * step
