@@ -94,6 +94,10 @@ STRONG: dict[str, dict[str, float | tuple[float, ...]]] = {
     "bending_profile": {"relative": (3.0, 0.0) * 6},
     "mass_profile": {"relative": (-0.7, 1.0) * 6},
     "stiffness_drift": {"rate": -3.0},
+    "bending_creep": {"rate": 20.0},
+    "rest_bow": {"curvature": (6.0, -4.0)},
+    "bending_stiffening": {"gain": 1e-3},
+    "bending_plasticity": {"radius": 0.5},
     "wind": {"coefficient": 2.0, "velocity": (6.0, -6.0)},
     "attraction": {"strength": 20.0, "center": (0.2, 0.1, -0.1), "range": 0.05},
     "tether": {"stiffness": 50.0, "arc": 0.9, "anchor": (0.3, 0.3, 0.0), "length": 0.1},
@@ -118,6 +122,9 @@ STRONG: dict[str, dict[str, float | tuple[float, ...]]] = {
 
 
 WITHIN = ("bend", "bend_stiffness", "spring", "inertia")  # hooks that change what the object is made of
+# To the choice of substeps these are another effect in another form: alone only.
+ALIKE = ("rest_bow", "bending_scale", "bending_region", "bending_gradient", "tip_mass", "mass_gradient", "stretch_scale",
+         "length_drift", "bending_plasticity")  # fmt: skip
 
 
 def _together(pair: tuple[str, str]) -> bool:
@@ -125,6 +132,8 @@ def _together(pair: tuple[str, str]) -> bool:
     first, second = (set(LIBRARY[id].hooks) for id in pair)
     if pair[0] == pair[1]:
         return bool(first & {"force", "boundary", *WITHIN})
+    if set(pair) & set(ALIKE):
+        return False
     return "bend" in first | second and bool(first & set(WITHIN)) and bool(second & set(WITHIN))
 
 
