@@ -1,0 +1,98 @@
+"""A planner for one twin and one goal: what the command line and the node both build."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from pred_core.config import load_yaml, from_mapping
+from pred_core.dynamics import Dynamics
+from pred_core.errors import ConfigError
+from pred_core.plan.collision_cost import CollisionCost
+from pred_core.plan.config import PlannerConfig
+from pred_core.plan.costs import Cost, Objective
+from pred_core.plan.goal import check_goal
+from pred_core.plan.goal_cost import GoalCost
+from pred_core.plan.motion_costs import SmoothnessCost, WorkspaceCost
+from pred_core.plan.passage_cost import PassageCost
+from pred_core.plan.planner import Planner, Watch
+from pred_core.plan.stretch_cost import StretchCost
+from pred_core.pred import with_residual
+from pred_core.springmass import SpringMass
+from pred_core.twin import Twin
+from pred_core.types import Array, Body, Scene
+
+
+def scene_with_slot(scene: Scene, config: PlannerConfig) -> Scene:
+    """The scene, with the posts of the configured slot."""
+    if config.slot is None:
+        return scene
+    return dataclasses.replace(scene, fixtures=scene.fixtures + config.slot.posts())
+
+
+def planning_dynamics(twin: Twin, scene: Scene, device: str = "cpu") -> Dynamics:
+    """What the twin predicts with in a scene; a world that diverges becomes NaN and does not stop the others."""
+    base = SpringMass(
+        twin.body,
+        twin.physics,
+        scene,
+        period=twin.meta.period,
+        substeps=twin.meta.substeps,
+        extensions=twin.extensions,
+        device=device,
+        diverged_as_nan=True,
+    )
+    return with_residual(base, twin, device)
+
+
+def make_objective(body: Body, scene: Scene, goal: Array, config: PlannerConfig) -> Objective:
+    """Every cost whose weight is not 0. `scene`: with its slot. goal (Q, 3) [m] world.
+
+    Raises: InputError for an unusable goal (goal.py); ConfigError for a passage cost without a slot.
+    """
+    c, m = config.costs, config.motion
+    low, high = np.array([m.x_low, m.y_low, m.z_low]), np.array([m.x_high, m.y_high, m.z_high])
+    points = check_goal(goal, body, scene, low, high)
+    seen = None if bool(body.surface.all()) else np.flatnonzero(body.surface)
+    costs: list[Cost] = []
+    if c.goal > 0.0 or c.goal_end > 0.0:
+        costs.append(GoalCost(points, seen, c.goal, c.goal_end))
+    if c.collision > 0.0:
+        costs.append(CollisionCost(scene, body, c.collision, c.margin, c.gripper_radius, c.gripper_length))
+    if c.smoothness > 0.0:
+        costs.append(SmoothnessCost(c.smoothness))
+    if c.workspace > 0.0:
+        costs.append(WorkspaceCost(low, high, c.workspace))
+    if c.stretch > 0.0:
+        costs.append(StretchCost(body, c.stretch, c.max_strain))
+    if c.passage > 0.0:
+        if config.slot is None:
+            raise ConfigError("costs.passage needs a slot", got="slot: null", next_step="Give 'slot' or weight 0")
+        costs.append(PassageCost(config.slot, body, c.passage))
+    return Objective(costs)
+
+
+def make_planner(
+    twin: Twin,
+    goal: Array,
+    config: PlannerConfig,
+    seed: int,
+    *,
+    device: str = "cpu",
+    dynamics: Dynamics | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    watch: Watch | None = None,
+) -> Planner:
+    """A planner that moves the twin's object to a goal (Q, 3) [m]. `dynamics`: instead of the twin's own."""
+    scene = scene_with_slot(twin.scene, config)
+    objective = make_objective(twin.body, scene, goal, config)
+    chosen = planning_dynamics(twin, scene, device) if dynamics is None else dynamics
+    return Planner(chosen, objective, config, np.random.default_rng(seed), clock=clock, watch=watch)
+
+
+def load_settings(path: str) -> PlannerConfig:
+    """The settings of a YAML file; '' = the defaults. Raises: ConfigError."""
+    return PlannerConfig() if not path else from_mapping(PlannerConfig, load_yaml(path) or {}, path)

@@ -1,0 +1,213 @@
+"""Each cost against a number worked out by hand; the chamfer cost needs both its sides."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from plan_cases import settings
+
+from pred_core.errors import ConfigError, InputError
+from pred_core.metrics.chamfer import chamfer_one_sided, chamfer_two_sided
+from pred_core.plan.collision_cost import CollisionCost
+from pred_core.plan.config import CostConfig
+from pred_core.plan.costs import Objective
+from pred_core.plan.distance import distance_to
+from pred_core.plan.goal import check_goal, thinned
+from pred_core.plan.goal_cost import GoalCost
+from pred_core.plan.motion_costs import SmoothnessCost, WorkspaceCost
+from pred_core.plan.passage_cost import PassageCost
+from pred_core.plan.rollouts import Rollouts
+from pred_core.plan.slot import Slot
+from pred_core.plan.stretch_cost import StretchCost
+from pred_core.plan.task import make_objective, scene_with_slot
+from pred_core.springmass import build_body
+from pred_core.springmass.reference import fixture_gap
+from pred_core.types import Body, Box, Capsule, Grip, Physics, Scene, Sphere
+
+LOW, HIGH = np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.0])
+
+
+def line_body(points: np.ndarray, radius: float = 0.0) -> Body:
+    spacing = float(np.linalg.norm(points[1] - points[0]))
+    return build_body("line", points, 0.05, Physics(connection_threshold=1.2 * spacing, max_springs=2), radius=radius)
+
+
+def rollouts(objects: np.ndarray, grippers: np.ndarray | None = None, knots: np.ndarray | None = None) -> Rollouts:
+    """K motions of one step: objects (K, N, 3), grippers (K, 3)."""
+    count = len(objects)
+    place = np.zeros((count, 3)) + [0.0, 0.0, 0.9] if grippers is None else grippers
+    grip = Grip(
+        torch.tensor(place, dtype=torch.float32)[None, :, None],
+        torch.tensor([1.0, 0, 0, 0]).expand(1, count, 1, 4),
+        torch.ones(1, count, 1, dtype=torch.bool),
+    )
+    position = torch.tensor(objects, dtype=torch.float32)[None]
+    return Rollouts(0.1, position, grip, np.zeros((6, count, 1, 4)) if knots is None else knots, 0.2, (0,))
+
+
+def row(count: int, spacing: float, start: tuple[float, float, float] = (0.0, 0.0, 0.3)) -> np.ndarray:
+    points = np.repeat(np.array([start]), count, axis=0)
+    points[:, 0] += spacing * np.arange(count)
+    return points
+
+
+def test_chamfer_is_two_sided() -> None:
+    """A crumpled object on one end of the goal, and one that overshoots it: each fools one of the two sides."""
+    goal = row(5, 0.1)  # 0 to 0.4 m
+    crumpled = row(5, 0.0)  # all on the goal's first point: side object -> goal is 0
+    longer = row(9, 0.1)  # 0 to 0.8 m: side goal -> object is 0
+    values = GoalCost(goal, None, 0.0, 1.0)(rollouts(np.stack([crumpled, row(5, 0.1)])))
+    # goal -> crumpled: mean of 0, .1, .2, .3, .4 = 0.2; object -> goal: 0.
+    assert values.tolist() == pytest.approx([0.2, 0.0], abs=1e-6)
+    assert chamfer_one_sided(crumpled, goal) == 0.0  # the side that a one-sided cost would have
+    # object -> goal: mean of five 0 and .1, .2, .3, .4 over 9 = 1/9; goal -> object: 0.
+    assert GoalCost(goal, None, 0.0, 1.0)(rollouts(longer[None])).item() == pytest.approx(1 / 9, abs=1e-6)
+    assert chamfer_one_sided(goal, longer) == 0.0
+
+
+def test_goal_cost_weighs_way_and_end_and_looks_at_the_surface_only() -> None:
+    goal, rng = row(5, 0.1), np.random.default_rng(0)
+    x = torch.tensor(goal + rng.normal(size=(3, 1, 5, 3)) * 0.05, dtype=torch.float32)
+    many = dataclasses.replace(rollouts(goal[None]), position=x, frames=(0, 1, 2))
+    each = [chamfer_two_sided(x[t, 0].double().numpy(), goal) for t in range(3)]
+    assert GoalCost(goal, None, 1.0, 2.0)(many).item() == pytest.approx(np.mean(each) + 2 * each[-1], rel=1e-5)
+    first = GoalCost(goal[:2], np.array([0, 1]), 0.0, 1.0)
+    moved = goal.copy()
+    moved[2:] += 5.0
+    assert first(rollouts(moved[None])).item() == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "fixture",
+    [
+        Box((0.1, -0.2, 0.3), (0.05, 0.1, 0.02), (0.8, 0.1, -0.5, 0.3)),
+        Capsule((0.0, 0.0, 0.0), (0.1, 0.2, 0.1), 0.08),
+        Sphere((0.1, 0.1, 0.1), 0.05),
+    ],
+)
+def test_distance_agrees_with_the_simulators_contact(fixture: Box | Capsule | Sphere) -> None:
+    points = np.random.default_rng(0).uniform(-0.4, 0.4, (2000, 3))
+    expected, _ = fixture_gap(fixture, torch.tensor(points))
+    found = distance_to(fixture, torch.tensor(points, dtype=torch.float32))
+    assert bool((expected < 0).any())
+    assert (found.double() - expected).abs().max().item() < 1e-6  # float32
+
+
+def collision(scene: Scene, body: Body) -> CollisionCost:
+    return CollisionCost(scene, body, 1.0, margin=0.005, radius=0.01, length=0.1)
+
+
+def test_collision_of_object_fingers_and_table() -> None:
+    body = line_body(row(3, 0.1), radius=0.002)
+    scene = Scene(ground=0.0, fixtures=(Sphere((0.05, 0.0, 0.3), 0.02),))
+    cost = collision(scene, body)
+    # Between particles 0 and 1 the line passes through the middle of the sphere: 20 + 5 + 2 mm deep.
+    assert cost.object_depth(rollouts(row(3, 0.1)[None])).item() == pytest.approx(0.027, abs=1e-6)
+    # The fingers stand from z = 0.25 to 0.35 m beside the sphere: 15 mm off its centre is 20 + 10 - 15 mm deep
+    # at the height of a sphere of the capsule; they lie 33.3 mm apart, the nearest 16.7 mm from its centre's height.
+    depth = cost.finger_depth(rollouts(row(3, 0.1)[None] + 5.0, np.array([[0.05, 0.015, 0.25]]))).item()
+    assert depth == pytest.approx(0.03 - np.hypot(0.015, 0.05 - 0.1 / 3), abs=1e-6)
+    under = cost.finger_depth(rollouts(row(3, 0.1)[None] + 5.0, np.array([[0.5, 0.5, -0.004]]))).item()
+    assert under == pytest.approx(0.004, abs=1e-6)
+
+
+def test_no_fixtures_and_no_table_cost_nothing() -> None:
+    body = line_body(row(3, 0.1))
+    assert collision(Scene(), body)(rollouts(row(3, 0.1)[None] - 5.0, np.array([[0.0, 0.0, -3.0]]))).tolist() == [0.0]
+
+
+def test_smoothness_is_the_root_mean_square_acceleration() -> None:
+    knots = np.zeros((6, 2, 1, 4))
+    knots[:, 0, 0, 1] = 0.2 * 3.0 * np.arange(6)  # velocity grows by 0.6 m/s each 0.2 s: 3 m/s^2 throughout
+    cost = SmoothnessCost(0.5)(rollouts(np.zeros((2, 2, 3)), knots=knots))
+    assert cost.tolist() == pytest.approx([1.5, 0.0], abs=1e-6)
+
+
+def test_workspace_is_the_way_out_of_the_box() -> None:
+    place = np.array([[0.0, 0.0, 0.5], [1.03, 0.0, -0.04]])
+    cost = WorkspaceCost(LOW, HIGH, 2.0)(rollouts(np.zeros((2, 2, 3)), place))
+    assert cost.tolist() == pytest.approx([0.0, 0.1], abs=1e-6)  # 3 and 4 cm: 5 cm, twice
+
+
+def test_stretch_beyond_what_is_free() -> None:
+    body = line_body(row(3, 0.1))
+    pulled = row(3, 0.1)
+    pulled[2, 0] += 0.02  # the second spring: 20 % longer
+    assert StretchCost(body, 1.0, 0.05)(rollouts(np.stack([row(3, 0.1), pulled]))).tolist() == pytest.approx(
+        [0.0, 0.15], abs=1e-5
+    )
+
+
+def test_passage_measures_how_far_beside_the_gap_a_line_crosses() -> None:
+    slot = Slot(x=0.1, y=0.0, gap=0.024, height=0.1)
+    body = line_body(row(2, 0.2, (0.0, 0.0, 0.05)), radius=0.004)
+    through = row(2, 0.2, (0.0, 0.005, 0.05))
+    beside, above, short = (through + d for d in ([0, 0.02, 0], [0, 0, 0.08], [-0.15, 0.3, 0]))
+    cost = PassageCost(slot, body, 1.0)(rollouts(np.stack([through, beside, above, short])))
+    # Opening: 8 mm to either side (12 less the radius), up to 9 cm. 25 mm beside -> 17 mm; z 13 cm -> 4 cm.
+    assert cost.tolist() == pytest.approx([0.0, 0.017, 0.04, 0.0], abs=1e-6)
+    with pytest.raises(ConfigError, match="a line"):
+        PassageCost(slot, dataclasses.replace(body, kind="sheet"), 1.0)
+
+
+def test_slot_posts_leave_the_gap_free() -> None:
+    slot = Slot(x=0.3, y=0.1, yaw=0.5, gap=0.024, width=0.09, thickness=0.012, height=0.1)
+    up = np.array([0.0, 0.0, 0.05])
+    inside = torch.tensor(slot.foot + up + np.outer([0.0, 0.0119], slot.axes[1]), dtype=torch.float32)
+    assert min(distance_to(p, inside).min().item() for p in slot.posts()) == pytest.approx(0.0001, abs=1e-5)
+    middle = torch.tensor(slot.foot + up + (0.012 + 0.045) * slot.axes[1], dtype=torch.float32)
+    assert distance_to(slot.posts()[1], middle).item() == pytest.approx(-0.006, abs=1e-6)  # half the thickness
+
+
+def test_a_diverged_motion_costs_infinity_and_hides_from_the_costs() -> None:
+    x = np.stack([row(5, 0.1), row(5, 0.1)])
+    x[1, 2] = np.nan
+    total, parts = Objective([GoalCost(row(5, 0.1), None, 1.0, 0.0)])(rollouts(x))
+    assert total[0] == pytest.approx(0.0, abs=1e-6) and total[1] == np.inf and parts["goal"][1] == np.inf
+
+
+def test_costs_need_names_of_their_own() -> None:
+    with pytest.raises(ConfigError, match="each name once"):
+        Objective([SmoothnessCost(1.0), SmoothnessCost(2.0)])
+
+
+@pytest.mark.parametrize(
+    ("goal", "line"),
+    [
+        (np.zeros((0, 3)), "goal is empty"),
+        (np.full((3, 3), np.nan), "not finite; got 3 of 3"),
+        (1000.0 * row(5, 0.1), "millimetres"),
+        (row(5, 0.3), "larger than the object"),
+        (row(5, 0.1) + [4.0, 0.0, 0.0], "out of reach"),
+        (row(5, 0.1) - [0.0, 0.0, 0.5], "under the table"),
+        (np.zeros((4, 2)), "shape"),
+    ],
+)
+def test_unusable_goals_are_refused_in_one_line(goal: np.ndarray, line: str) -> None:
+    with pytest.raises(InputError, match=line) as caught:
+        check_goal(goal, line_body(row(5, 0.1)), Scene(ground=0.0), LOW, HIGH)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_large_goal_is_thinned_evenly() -> None:
+    cloud = np.random.default_rng(0).uniform(0.0, 1.0, (20_000, 3)) * [1.0, 0.1, 0.1]
+    kept = thinned(cloud, 500)
+    assert 400 < len(kept) <= 500
+    counts = np.histogram(kept[:, 0], bins=5, range=(0, 1))[0]
+    assert counts.min() > 0.5 * counts.max()
+
+
+def test_weights_of_zero_leave_costs_out_and_passage_needs_a_slot() -> None:
+    body, config = line_body(row(5, 0.1)), settings()
+    chosen = dataclasses.replace(config, costs=CostConfig(collision=0.0, stretch=0.0))
+    names = {c.name for c in make_objective(body, Scene(), row(5, 0.1), chosen).costs}
+    assert names == {"goal", "smoothness", "workspace"}
+    with pytest.raises(ConfigError, match="needs a slot"):
+        make_objective(body, Scene(), row(5, 0.1), dataclasses.replace(config, costs=CostConfig(passage=1.0)))
+    slotted = dataclasses.replace(config, slot=Slot())
+    assert len(scene_with_slot(Scene(), slotted).fixtures) == 2
+
+
