@@ -17,6 +17,7 @@ from pred_core.effects import LIBRARY
 from pred_core.frames import quaternion_from_rotation_vector
 from pred_core.springmass import SpringMass
 from pred_core.springmass.arrays import mass_of_worlds
+from pred_core.springmass.reference import Reference
 from pred_core.twin import Extension
 from pred_core.types import Body, Grip, Physics, Scene, State
 
@@ -289,3 +290,60 @@ def test_planted_value_is_found(id: str) -> None:
     found = least_squares(residual, coordinates(begin), jacobian, loss="soft_l1", f_scale=0.01, max_nfev=40)
     for name, value in values(found.x).items():
         assert math.dist(value, planted[name]) < 0.02 * math.hypot(*planted[name]), (name, value)
+
+
+def everything(ids: list[str], amount: float = 1.0) -> tuple[Extension, ...]:
+    """These effects at once, at a share of their planted changes."""
+    out = []
+    for id in ids:
+        shares = {q.name: (np.array(PLANTED[id][0][q.name]) - q.null) * amount + q.null
+                  for q in LIBRARY[id].parameters}  # fmt: skip
+        out.append(LIBRARY[id].extension(**{k: tuple(v.tolist()) for k, v in shares.items()}))
+    return tuple(out)
+
+
+@pytest.mark.parametrize("worlds", [2, 5])  # one after the other, and in lanes
+def test_all_laws_together_equal_the_reference(worlds: int) -> None:
+    body, scene = line(12, 0.55, radius=0.004), Scene(ground=-0.006)
+    physics = [Physics(stiffness=60.0, damping=0.1, bending_stiffness=2e-4, ground_friction=0.1 * w)
+               for w in range(1, worlds + 1)]  # fmt: skip
+    extensions = [everything(list(PLANTED), 0.3 + 0.1 * w) for w in range(worlds)]
+    sim = SpringMass(body, physics, scene, extensions=extensions, substeps=20)
+    twin = Reference(body, physics, scene, substeps=20, extensions=extensions)
+    rng = np.random.default_rng(0)
+    speed = rng.normal(size=(worlds, 12, 3)) * 0.3
+    state = holding(state_of(np.stack([body.rest_position] * worlds), speed), {0: 0, 1: 0})
+    begin = begun(sim.start(state, still(torch.zeros(worlds, 1, 3))), 60.0)
+    grips = still(torch.zeros(worlds, 1, 3), 6)
+    x, after = sim.rollout_states(begin, grips)
+    expected, velocity = twin.rollout(begin, grips)
+    # Float32 against float64 over 120 substeps.
+    assert float((x - expected).abs().max()) < 2e-6
+    assert float((after.velocity - velocity).abs().max()) < 2e-4
+
+
+def test_what_acts_within_the_object_keeps_its_momentum() -> None:
+    within = [id for id in PLANTED if set(LIBRARY[id].hooks) <= {"spring", "bend_stiffness", "inertia"}]
+    assert len(within) == 9
+    body, extensions = line(12), everything(within)
+    mass = mass_of_worlds(body, [extensions], tuple(LIBRARY[id] for id in within))[0][:, None].double()
+    sim = SpringMass(body, Physics(stiffness=60.0, damping=0.1, bending_stiffness=2e-4), NOWHERE, extensions=extensions)
+    speed = np.random.default_rng(0).normal(size=(12, 3)) * 0.3
+    begin = begun(sim.start(state_of(body.rest_position, speed)), 60.0)
+    _, after = sim.rollout_states(begin, nobody(50))
+    lost = (mass * (after.velocity - begin.velocity).double()).sum(0)
+    assert float(lost.norm()) < 1e-5 * float((mass * begin.velocity.double().abs()).sum())
+
+
+def test_no_friction_law_speeds_anything_up() -> None:
+    place = [[0.1 * n, 0.02 * n, 0.0] for n in range(8)]
+    velocity = np.random.default_rng(0).normal(size=(8, 3)) * [0.5, 0.5, 0.0]
+    laws = everything([id for id in ON_TABLE if not id.startswith("table")], 0.5)
+    sim = SpringMass(particles(np.array(place)), Physics(ground_friction=0.2), Scene(ground=0.0), extensions=laws)
+    state = sim.start(state_of(np.array(place), velocity))
+    speeds = [state.velocity.norm(dim=-1)]
+    for _ in range(60):
+        state = sim.step(state, nobody())
+        speeds.append(state.velocity.norm(dim=-1))
+    assert bool((torch.stack(speeds).diff(dim=0) <= 1e-7).all())
+    assert float(speeds[-1].max()) == 0.0

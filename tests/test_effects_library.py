@@ -115,7 +115,7 @@ STRONG: dict[str, dict[str, float | tuple[float, ...]]] = {
     "table_tilt": {"slope": (0.2, 0.2)},
     "bending_gradient": {"slope": -1.9},
     "strain_stiffening": {"growth": 1e5},
-    "stretch_scale": {"change": 2.0},
+    "stretch_scale": {"change": 1.5},
     "length_drift": {"rate": 0.2},
     "length_scale": {"change": -0.1},
 }

@@ -9,12 +9,12 @@ from pred_core.effects.effect import Effect, Parameter, SpringContext
 
 
 class StretchScale(Effect):
-    """Tension k (1 + a) e, e the strain. Up to a = 2 it stays inside the margin of the substeps chosen for k."""
+    """Tension k (1 + a) e, e the strain. With a <= 3/2 the substeps chosen for k have room, also for `StrainStiffening`."""
 
     id = "stretch_scale"
     family = "stretch"
     hooks = ("spring",)
-    parameters = (Parameter("change", "1", -0.95, 2.0, typical=0.2, doc="a, relative change of the stiffness"),)
+    parameters = (Parameter("change", "1", -0.95, 1.5, typical=0.2, doc="a, relative change of the stiffness"),)
     confounded_with = ("strain_stiffening", "length_scale")
 
     @classmethod
