@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -49,6 +50,14 @@ class Record:
         return _between(self.time, self.reference, time)
 
 
+class Pusher(Protocol):
+    """What moves the gripper; `Drive` is one."""
+
+    def push(self, data: mujoco.MjData, step: int) -> None:
+        """Set the forces of a step."""
+        ...
+
+
 class World:
     """A compiled rope and what effects may read and change between MuJoCo's two half steps."""
 
@@ -89,12 +98,12 @@ class World:
         """Add forces (L, 3) [N] at the middles of the links for this step."""
         self.data.xfrc_applied[self.links, :3] += force
 
-    def step(self, drive: Drive | None = None, index: int = 0, drag: float = 0.0) -> None:
+    def step(self, drive: Pusher | None = None, index: int = 0, drag: float = 0.0) -> None:
         """One MuJoCo step; the drive follows its reference `index`."""
         mujoco.mj_step1(self.model, self.data)
         self.finish_step(drive, index, drag)
 
-    def finish_step(self, drive: Drive | None, index: int, drag: float) -> None:
+    def finish_step(self, drive: Pusher | None, index: int, drag: float) -> None:
         """The second half of a step: effects, drive, forces, integration."""
         data = self.data
         data.xfrc_applied[:] = 0.0
@@ -146,7 +155,7 @@ def run_episode(world: World, motion: Motion, seconds: float, particles: int) ->
     arc = np.linspace(0.0, rope.length, particles)
     position = np.empty((count - settle + lead, particles, 3))
     gripper = np.empty((len(position), DOF))
-    with _mujoco_warnings() as warnings:
+    with mujoco_warnings() as warnings:
         for k in range(count):
             world.time = (k - settle) * STEP
             mujoco.mj_step1(world.model, world.data)
@@ -182,7 +191,7 @@ def lay(world: World, motion: Motion) -> None:
 
 
 @contextlib.contextmanager
-def _mujoco_warnings() -> Iterator[list[str]]:
+def mujoco_warnings() -> Iterator[list[str]]:
     """What MuJoCo warns of meanwhile. By itself it would print it and append it to a file in the working directory."""
     texts: list[str] = []
     before = mujoco.get_mju_user_warning()
