@@ -98,6 +98,9 @@ STRONG: dict[str, dict[str, float | tuple[float, ...]]] = {
     "rest_bow": {"curvature": (6.0, -4.0)},
     "bending_stiffening": {"gain": 1e-3},
     "bending_plasticity": {"radius": 0.5},
+    "gripper_offset": {"offset": (0.05, -0.05, 0.05)},
+    "gripper_rotation": {"rotation": (0.3, -0.5, 0.4)},
+    "grip_slip": {"weakness": 0.4, "damping": 5.0},
     "wind": {"coefficient": 2.0, "velocity": (6.0, -6.0)},
     "attraction": {"strength": 20.0, "center": (0.2, 0.1, -0.1), "range": 0.05},
     "tether": {"stiffness": 50.0, "arc": 0.9, "anchor": (0.3, 0.3, 0.0), "length": 0.1},
@@ -123,8 +126,10 @@ STRONG: dict[str, dict[str, float | tuple[float, ...]]] = {
 
 WITHIN = ("bend", "bend_stiffness", "spring", "inertia")  # hooks that change what the object is made of
 # To the choice of substeps these are another effect in another form: alone only.
-ALIKE = ("rest_bow", "bending_scale", "bending_region", "bending_gradient", "tip_mass", "mass_gradient", "stretch_scale",
-         "length_drift", "bending_plasticity")  # fmt: skip
+ALIKE = (
+    "rest_bow", "bending_scale", "bending_region", "bending_gradient", "tip_mass", "mass_gradient", "stretch_scale",
+    "length_drift", "bending_plasticity",
+)  # fmt: skip
 
 
 def _together(pair: tuple[str, str]) -> bool:

@@ -21,6 +21,9 @@ from pred_core.effects.friction_patch import FrictionPatch
 from pred_core.effects.friction_scale import FrictionScale
 from pred_core.effects.friction_viscous import FrictionViscous
 from pred_core.effects.gravity_offset import GravityOffset
+from pred_core.effects.grip_slip import GripSlip
+from pred_core.effects.gripper_offset import GripperOffset
+from pred_core.effects.gripper_rotation import GripperRotation
 from pred_core.effects.length_drift import LengthDrift
 from pred_core.effects.length_scale import LengthScale
 from pred_core.effects.mass_gradient import MassGradient
@@ -72,6 +75,9 @@ _ALL: tuple[type[Effect], ...] = (
     RestBow,
     BendingStiffening,
     BendingPlasticity,
+    GripperOffset,
+    GripperRotation,
+    GripSlip,
 )
 LIBRARY: dict[str, type[Effect]] = {e.id: e for e in _ALL}
 

@@ -34,6 +34,9 @@ class Parameter:
     log: bool = False  # positive, searched on a log scale
     starts: tuple[float, ...] = ()  # refined, not searched globally: where a refinement starts, and what else it tries
     doc: str = ""
+    # It matters only with another parameter on, and has many optima: values that a diagnosis tries first come from
+    # "place": where the object was (world); "floor": the same, x and y; "arc": along the object; "direction": all round.
+    scan: str = ""
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,19 @@ class GripContext:
     lever: Vec3  # [m] world, from the gripper's origin to the particle
     axes: tuple[Vec3, Vec3, Vec3]  # gripper axes in world
     time: Any  # [s]
+    memory: tuple[Any, ...] = ()  # what `slide` keeps for this particle
+
+
+@dataclass(frozen=True)
+class SlideContext:
+    """What a law of how a grip gives way may read. All that one gripper holds is one rigid piece."""
+
+    pull: Vec3  # [N] world, on that piece: the rest of the object, gravity and `force` hooks; not contact
+    mass: Any  # [kg] of that piece
+    axes: tuple[Vec3, Vec3, Vec3]  # gripper axes in world
+    substep: Any  # [s]
+    time: Any  # [s]
+    memory: tuple[Any, ...]  # `grip_memory` values of the last substep; 0 when the gripper closes
 
 
 class Effect:
@@ -110,6 +126,7 @@ class Effect:
     parameters: ClassVar[tuple[Parameter, ...]]
     confounded_with: ClassVar[tuple[str, ...]] = ()
     bend_memory: ClassVar[int] = 0  # values a `bend` hook keeps per bend
+    grip_memory: ClassVar[int] = 0  # values a `boundary` hook keeps per held particle, moved on by `slide`
     end_twist: ClassVar[str] = ""  # the parameter [rad] by which a line's far material axes are turned in its gripper
 
     @classmethod
@@ -163,6 +180,11 @@ class Effect:
     def boundary(cls, p: Mapping[str, Any], at: GripContext) -> Vec3:
         """Displacement of a held particle's target [m] world."""
         raise AttributeError(f"{cls.id} has no boundary hook")
+
+    @classmethod
+    def slide(cls, p: Mapping[str, Any], at: SlideContext) -> tuple[Any, ...]:
+        """The new memory, once a substep for each held particle; then `boundary` places the particle by it."""
+        raise AttributeError(f"{cls.id} keeps no memory of its grip")
 
     @classmethod
     def inertia(cls, p: Mapping[str, Any], arc: Any) -> Any:

@@ -78,6 +78,7 @@ class Worlds:
     grips: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     frame_grip: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     memory: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
+    load: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     time: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     steps: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     clock: wp.array(dtype=wp.int32)  # type: ignore[valid-type]
@@ -97,11 +98,13 @@ def stride(lanes: int, staged: bool) -> int:
 def kernel_text(effects: tuple[type[Effect], ...], lanes: int, staged: bool) -> str:
     """The C++ of the native function, every placeholder filled."""
     framed = any("bend" in e.hooks for e in effects)
+    grips = sum(e.grip_memory for e in effects)
     eight = stride(lanes, staged) == 4
     text = "\n".join(
         (source.PRELUDE, source_bending.FRAME if framed else "", source.SPRING, source.SPRING_EIGHT if eight else "",
-         source_bending.BEND, source_contact.CONTACT, source_contact.SELF_COLLISION, source_contact.PARTICLE,
-         source_contact.HELD, source.STAGED if staged else source.FUSED)
+         source_bending.BEND, source_contact.CONTACT, source_contact.SELF_COLLISION,
+         source_contact.GRIP_MEMORY if grips else "", source_contact.PARTICLE, source_contact.HELD,
+         source.STAGED if staged else source.FUSED)
     )  # fmt: skip
     parts = {
         "@SPRING_LAW@": source.SPRING_LAW,
@@ -116,7 +119,9 @@ def kernel_text(effects: tuple[type[Effect], ...], lanes: int, staged: bool) -> 
         "@BEND_MOMENT@": source_bending.BEND_MOMENT if framed else "",
         "@END_TWIST@": end_twist(effects),
     }
-    for placeholder, statements in (*parts.items(), *law_statements(effects).items()):
+    laws = law_statements(effects)
+    parts |= {"@LOAD@": source_contact.LOAD if grips else "", "@GRIP_SLOTS@": str(grips)}
+    for placeholder, statements in (*parts.items(), *laws.items(), ("@PULL@", source_contact.PULL)):
         text = text.replace(placeholder, statements)
     return text
 

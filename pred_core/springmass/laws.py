@@ -12,6 +12,7 @@ from pred_core.effects.effect import (
     Effect,
     GripContext,
     ParticleContext,
+    SlideContext,
     SpringContext,
 )
 
@@ -24,7 +25,6 @@ def law_statements(effects: tuple[type[Effect], ...]) -> dict[str, str]:
         "force": ("@FORCE@", _force),
         "spring": ("@SPRING@", _spring),
         "contact": ("@CONTACT@", _contact),
-        "boundary": ("@BOUNDARY@", _boundary),
         "bend_stiffness": ("@BEND_STIFFNESS@", _bend_stiffness),
     }
     parts: dict[str, list[str]] = {placeholder: [] for placeholder, _ in writers.values()}
@@ -37,6 +37,7 @@ def law_statements(effects: tuple[type[Effect], ...]) -> dict[str, str]:
                 parts[placeholder] += [*code.lines, *tail]
         row += sum(q.size for q in effect.parameters)
     parts["@BEND@"] = _bends(effects)
+    parts["@BOUNDARY@"], parts["@SLIDE@"] = _grips(effects)
     return {placeholder: "\n    ".join(lines) for placeholder, lines in parts.items()}
 
 
@@ -110,13 +111,48 @@ def _contact(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
     return lines + ([f"ground += {height.name};"] if isinstance(height, Traced) else [])
 
 
-def _boundary(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
+def _grips(effects: tuple[type[Effect], ...]) -> tuple[list[str], list[str]]:
+    """Displacements of held particles, and how the memories they may depend on move on."""
+    place, slide, row, slot = [], [], BASE_PARAMETERS, 0
+    for number, effect in enumerate(effects):
+        if "boundary" in effect.hooks:
+            kept = [f"grip_memory[{slot + k} * N + held[2 * entry]]" for k in range(effect.grip_memory)]
+            code = Code(f"boundary{number}_")
+            tail = _boundary(code, _parameters(code, effect, row), effect, kept)
+            place += [*code.lines, *tail]
+            if kept:
+                code = Code(f"slide{number}_")
+                tail = _slide(code, _parameters(code, effect, row), effect, kept)
+                slide += [*code.lines, *tail]
+        slot += effect.grip_memory
+        row += sum(q.size for q in effect.parameters)
+    return place, ["@PULL@", *slide] if slide else []
+
+
+def _axes(code: Code) -> tuple[Vec3, Vec3, Vec3]:
     w, x, y, z = (_value(code, n) for n in ("qw", "qx", "qy", "qz"))
-    axes = (
+    return (
         Vec3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
         Vec3(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
         Vec3(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
+
+
+def _slide(code: Code, p: dict[str, Any], effect: type[Effect], kept: list[str]) -> list[str]:
+    at = SlideContext(
+        pull=_vector(code, "pull_x", "pull_y", "pull_z"),
+        mass=_value(code, "pulled_mass"),
+        axes=_axes(code),
+        substep=_value(code, "Lane(h)"),
+        time=_value(code, "time"),
+        memory=tuple(_value(code, place) for place in kept),
+    )
+    memory = effect.slide(p, at)
+    return [f"{place} = lane_select(on, {lane_text(v)}, {place});" for place, v in zip(kept, memory, strict=True)]
+
+
+def _boundary(code: Code, p: dict[str, Any], effect: type[Effect], kept: list[str]) -> list[str]:
+    axes = _axes(code)
     speed = [code.emit(f"(g1[{k}] - g0[{k}]) * m.inverse_period") for k in range(3)]
     place = [code.emit(f"beta * g0[{k}] + alpha * g1[{k}]") for k in range(3)]
     at = GripContext(
@@ -125,6 +161,7 @@ def _boundary(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
         lever=_vector(code, "lx", "ly", "lz"),
         axes=axes,
         time=_value(code, "time"),
+        memory=tuple(_value(code, place) for place in kept),
     )
     d = effect.boundary(p, at)
     return [f"r{k} += {lane_text(v)};" for k, v in zip("xyz", (d.x, d.y, d.z), strict=True)]

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pred_core.effects.algebra import Vec3
-from pred_core.effects.effect import ContactContext, Effect, GripContext, ParticleContext, SpringContext
+from pred_core.effects.effect import ContactContext, Effect, GripContext, ParticleContext, SlideContext, SpringContext
 from pred_core.frames import quaternion_normalize, quaternion_rotate, quaternion_to_matrix
 from pred_core.springmass import grasp
 from pred_core.springmass.arrays import bend_rows, chains, mass_of_worlds
@@ -25,6 +25,7 @@ from pred_core.twin import Extension
 from pred_core.types import Body, Box, Fixture, Grip, Physics, Scene, Sphere, State
 
 TINY = 1e-18
+GripMemory = dict[int, tuple[Tensor, ...]]  # per effect with a `boundary` hook: (W, N) each
 
 
 def column(values: Sequence[float]) -> Tensor:
@@ -75,12 +76,17 @@ class Reference:
         held, offset = state.held, memory["grip_offset"].double()
         begun = memory["time"].double()[:, None]
         bend_memory = BendMemory()
+        kept = {
+            n: (torch.zeros_like(x[..., 0]),) * effect.grip_memory
+            for n, (effect, _) in enumerate(self.hooks("boundary"))
+        }
         out, pairs = [], None
         for t in range(grips.position.shape[0]):
             turned = _near(grips.rotation[t].double(), before.rotation)
             after = Grip(grips.position[t].double(), turned, grips.closed[t])
             now = State(x, v, held, {"grip_offset": offset})
-            held, offset = grasp.close_and_open(now, before, after.closed, self.scene.grasp_radius)
+            was, (held, offset) = held, grasp.close_and_open(now, before, after.closed, self.scene.grasp_radius)
+            kept = {n: tuple(m.masked_fill(held != was, 0.0) for m in values) for n, values in kept.items()}
             if self.near is not None:
                 nexts = Grip(after.position[None], after.rotation[None], after.closed[None])
                 pairs = candidate_pairs(self.body, self.near, State(x, v, held), before, nexts, self.period).long()
@@ -92,8 +98,8 @@ class Reference:
                 force = force + bend_forces(self, x, held, rotation, time, h, bend_memory)
                 if pairs is not None:
                     force = force + self.pair_forces(x, v, pairs, h)
-                x, v = self.integrate(x, v, force, before, after, alpha, time, h)
-                x, v = self.hold(x, v, held, offset, before, after, sub, time + h, h)
+                x, v, load = self.integrate(x, v, force, before, after, alpha, time, h)
+                x, v, kept = self.hold(x, v, load, held, offset, kept, before, after, sub, time + h, h)
             before = after
             out.append(x)
         return torch.stack(out), v
@@ -136,14 +142,16 @@ class Reference:
 
     def integrate(
         self, x: Tensor, v: Tensor, force: Tensor, before: Grip, after: Grip, alpha: float, time: Tensor, h: float
-    ) -> tuple[Tensor, Tensor]:
-        """Semi-implicit Euler with contact: pusher, fixtures, ground."""
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Semi-implicit Euler with contact: pusher, fixtures, ground. (x, v, all forces but contact)."""
         scene, radius = self.scene, self.body.radius
         place, speed = Vec3.of(x), Vec3.of(v)
         for effect, p in self.hooks("force"):
             f = effect.force(p, ParticleContext(place, speed, self.mass, self.arc, time))
             force = force + torch.stack([torch.as_tensor(c) + torch.zeros_like(x[..., 0]) for c in (f.x, f.y, f.z)], -1)
-        v = v + h * (force / self.mass[..., None] + torch.tensor(scene.gravity, dtype=torch.float64))
+        gravity = torch.tensor(scene.gravity, dtype=torch.float64)
+        load = force + self.mass[..., None] * gravity
+        v = v + h * (force / self.mass[..., None] + gravity)
         out = torch.zeros_like(x)
         if scene.pusher_radius > 0.0:
             for g in range(after.position.shape[1]):
@@ -168,15 +176,15 @@ class Reference:
             up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(x)
             v, push = press(x[..., 2] - height - radius, up, still, mu, v, h)
             out = out + push
-        return x + h * v + out, v
+        return x + h * v + out, v, load
 
     def hold(
-        self, x: Tensor, v: Tensor, held: Tensor, offset: Tensor, before: Grip, after: Grip, sub: int, time: Tensor,
-        h: float,
-    ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Held particles follow their grippers, with the velocity of that motion."""
+        self, x: Tensor, v: Tensor, load: Tensor, held: Tensor, offset: Tensor, kept: GripMemory, before: Grip,
+        after: Grip, sub: int, time: Tensor, h: float,
+    ) -> tuple[Tensor, Tensor, GripMemory]:  # fmt: skip
+        """Held particles follow their grippers, with the velocity of that motion. (x, v, what grips keep)."""
         if before.position.shape[1] == 0:
-            return x, v
+            return x, v, kept
         on = (held >= 0)[..., None]
         index = held.clamp_min(0).long()
 
@@ -186,22 +194,33 @@ class Reference:
         p0, p1, q0, q1 = (of(v) for v in (before.position, after.position, before.rotation, after.rotation))
         speed = (p1 - p0) / self.period
 
-        def lever(alpha: float, when: Tensor) -> Tensor:
+        def turned(alpha: float) -> tuple[Tensor, tuple[Vec3, Vec3, Vec3]]:
             q = quaternion_normalize((1 - alpha) * q0 + alpha * q1)
-            r = arm = quaternion_rotate(q, offset)
             axes = quaternion_to_matrix(q)
-            for effect, p in self.hooks("boundary"):
+            return q, (Vec3.of(axes[..., :, 0]), Vec3.of(axes[..., :, 1]), Vec3.of(axes[..., :, 2]))
+
+        def lever(alpha: float, when: Tensor, kept: GripMemory) -> Tensor:
+            q, axes = turned(alpha)
+            r = arm = quaternion_rotate(q, offset)
+            for number, (effect, p) in enumerate(self.hooks("boundary")):
                 place = Vec3.of((1 - alpha) * p0 + alpha * p1 + r)
-                columns = tuple(Vec3.of(axes[..., :, k]) for k in range(3))
-                d = effect.boundary(p, GripContext(place, Vec3.of(speed), Vec3.of(arm), columns, when))  # type: ignore[arg-type]
+                d = effect.boundary(p, GripContext(place, Vec3.of(speed), Vec3.of(arm), axes, when, kept[number]))
                 r = r + torch.stack([torch.as_tensor(c) + torch.zeros_like(r[..., 0]) for c in (d.x, d.y, d.z)], -1)
             return r
 
         alpha = (sub + 1) / self.substeps
-        now = lever(alpha, time)
-        last = lever(sub / self.substeps, time - h)
+        last = lever(sub / self.substeps, time - h, kept)
+        same = ((held[:, :, None] == held[:, None, :]) & on).double()  # (W, N, N) of one gripper
+        pull, mass = same @ load, (same @ self.mass[..., None])[..., 0].clamp_min(TINY)
+        for number, (effect, p) in enumerate(self.hooks("boundary")):
+            if effect.grip_memory:
+                step = torch.tensor(h, dtype=x.dtype)
+                at = SlideContext(Vec3.of(pull), mass, turned(alpha)[1], step, time, kept[number])
+                moved = effect.slide(p, at)
+                kept = kept | {number: tuple(torch.where(on[..., 0], m, torch.zeros_like(m)) for m in moved)}
+        now = lever(alpha, time, kept)
         target = (1 - alpha) * p0 + alpha * p1 + now
-        return torch.where(on, target, x), torch.where(on, speed + (now - last) / h, v)
+        return torch.where(on, target, x), torch.where(on, speed + (now - last) / h, v), kept
 
 
 def press(gap: Tensor, normal: Tensor, moving: Tensor, mu: Tensor, v: Tensor, h: float) -> tuple[Tensor, Tensor]:

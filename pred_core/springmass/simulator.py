@@ -75,7 +75,9 @@ class SpringMass:
         framed = any("bend" in e.hooks for e in self.effects)
         slots = 2 + sum(e.bend_memory for e in self.effects)
         # Per line the twist angle and a director, per bend two curvatures and what `bend` hooks keep.
-        self._memory_size = 4 * len(self._lines) + slots * len(body.bends) if framed else 0
+        frame_size = 4 * len(self._lines) + slots * len(body.bends) if framed else 0
+        self._grip_size = body.count * sum(e.grip_memory for e in self.effects)  # at the end: per slot and particle
+        self._memory_size = frame_size + self._grip_size
         self._bends = len(body.bends) if framed or any(p.bending_stiffness != 0.0 for p in self.physics) else 0
         self._constants: dict[tuple[int, int], dict[str, Tensor]] = {}
         self._workspaces: dict[Size, tuple[Workspace, Tensor, Tensor]] = {}
@@ -150,6 +152,7 @@ class SpringMass:
         grasp.check_poses(grips)
         if not torch.equal(before.closed, grips.closed[0]):
             held, memory["grip_offset"] = grasp.close_and_open(state, before, grips.closed[0], self.scene.grasp_radius)
+            memory["effects"] = self._regripped(memory["effects"], held != state.held)
             state = state.replace(held=held, memory=memory)
         work, held_particles = self._workspace(state.held, grips)
         tensors = work.tensors
@@ -179,6 +182,13 @@ class SpringMass:
         position, velocity = unpack(work.position, worlds), unpack(work.velocity, worlds)
         trajectory = tensors["trajectory_out"][:, :worlds].clone() if record else position
         return State(position, velocity, state.held, memory), trajectory
+
+    def _regripped(self, memory: Tensor, changed: Tensor) -> Tensor:
+        """Effect memory (W, M) with what grips keep set to zero for particles (W, N) that another gripper has now."""
+        if self._grip_size == 0:
+            return memory
+        grips = memory[:, -self._grip_size :].unflatten(1, (-1, self.body.count)).masked_fill(changed[:, None], 0.0)
+        return torch.cat((memory[:, : -self._grip_size], grips.flatten(1)), dim=1)
 
     def _workspace(self, held: Tensor, grips: Grip) -> tuple[Workspace, Tensor]:
         """Buffers that fit the call, set up for who is held; and the particle of each held entry."""

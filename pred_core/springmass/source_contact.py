@@ -82,6 +82,7 @@ PARTICLE = r"""
     Lane vx = V[D * i], vy = V[D * i + 1], vz = V[D * i + 2];
     Lane fx = A[D * i], fy = A[D * i + 1], fz = A[D * i + 2];
     @FORCE@
+    @LOAD@
     const Lane gain = h * inverse_mass[i];
     vx += fx * gain + h * m.gravity_x; vy += fy * gain + h * m.gravity_y; vz += fz * gain + h * m.gravity_z;
     const Lane mu0 = friction * e[0];
@@ -122,6 +123,30 @@ PARTICLE = r"""
   };
 """
 
+# What all forces but contact do to a particle, kept for the pull on what is held; and where grips keep their memory.
+LOAD = "load[3 * i] = fx + m_i * m.gravity_x; load[3 * i + 1] = fy + m_i * m.gravity_y; " \
+       "load[3 * i + 2] = fz + m_i * m.gravity_z;"  # fmt: skip
+GRIP_MEMORY = r"""
+  Lane* load = (Lane*)w.load.data + (size_t)block * N * 3;
+  Lane* grip_memory = (Lane*)w.memory.data + (size_t)block * m.memory_count + m.memory_count - @GRIP_SLOTS@ * N;
+"""
+# The pull on all that the gripper of this entry holds, its mass, and the gripper's turn at the end of the substep.
+PULL = r"""
+    Lane pull_x = zero, pull_y = zero, pull_z = zero, pulled_mass = zero;
+    for (int other = 0; other < H; ++other) {
+      if (held[2 * other + 1] != g) continue;
+      const Lane share = lane_select(held_mask[other] > Lane(0.5f), one, zero);
+      const Lane* of = load + 3 * held[2 * other];
+      pull_x += share * of[0]; pull_y += share * of[1]; pull_z += share * of[2];
+      pulled_mass += share * mass[held[2 * other]];
+    }
+    pulled_mass = lane_max(pulled_mass, tiny);  // lanes that hold nothing here
+    Lane qw = beta * g0[3] + alpha * g1[3], qx = beta * g0[4] + alpha * g1[4], qy = beta * g0[5] + alpha * g1[5],
+         qz = beta * g0[6] + alpha * g1[6];
+    const Lane turn = one / lane_sqrt(qw * qw + qx * qx + qy * qy + qz * qz + tiny);
+    qw *= turn; qx *= turn; qy *= turn; qz *= turn;
+"""
+
 HELD = r"""
   // Where a held particle is from its gripper's origin, in world axes: its lever and what boundary laws add.
   auto lever = [&](int entry, int period, float alpha, Lane time, Lane& rx, Lane& ry, Lane& rz) {
@@ -152,6 +177,7 @@ HELD = r"""
     const float alpha = (sub + 1) * m.inverse_substeps, beta = 1.0f - alpha;
     Lane* before = held_lever + 3 * entry;
     if (sub == 0) lever(entry, period, 0.0f, time - h, before[0], before[1], before[2]);
+    @SLIDE@
     Lane r[3];
     lever(entry, period, alpha, time, r[0], r[1], r[2]);
     for (int k = 0; k < 3; ++k) {

@@ -31,6 +31,8 @@ class Workspace:
         effects: tuple[type[Effect], ...], staged: bool, device: str,
     ):  # fmt: skip
         particles, memory, lines = body
+        loads = particles if any(e.grip_memory for e in effects) else 0
+        self.framed = any("bend" in e.hooks for e in effects)
         blocks = -(-size.worlds // lanes)
         self.lanes, self.staged, self.device, self.model = lanes, staged, device, model
         wide = kernel.stride(lanes, staged)
@@ -44,6 +46,7 @@ class Workspace:
             "grips": (blocks, size.periods + 1, size.grippers, 8, lanes),
             "frame_grip": (blocks, lines, 2, lanes),
             "memory": (blocks, memory, lanes),
+            "load": (blocks, loads, 3, lanes),
             "time": (blocks, lanes),
             "steps": (blocks, lanes),
             "trajectory_out": (size.periods, blocks * lanes, particles, 3),
@@ -73,7 +76,7 @@ class Workspace:
                 )
             self._command.launch()
             return
-        bends = model.chain_count if model.memory_count else model.bend_count
+        bends = model.chain_count if self.framed else model.bend_count
         sizes = (model.spring_count, max(bends, model.pair_count), model.particles, model.held_count)
         self.record.clock.zero_()
         kernel.launch_staged(self.run, model, self.record, model.periods, self.device, sizes)
