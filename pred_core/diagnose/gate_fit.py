@@ -20,6 +20,7 @@ GLOBAL = 8  # unknowns that all held particles share: delay [s], scale - 1, turn
 HUBER = 3.0  # robust: residuals beyond as many deviations count linearly
 FINEST = 1e-5  # [m] noise assumed at least: what a tracker's float32 metres and a pose's rounding leave
 KNOT = 0.5  # [s] between the knots of a slide
+GLANCE = 5  # every fifth frame tells the noise
 FREE_SLIDE = 0.3  # [m] prior deviation of a knot
 
 
@@ -48,8 +49,8 @@ class Normal:
 
 
 def residuals(track: HeldTrack, lever: Array, shared: Array, center: Array) -> tuple[Array, Array, Array]:
-    """Residual (T, 3) [m] (NaN where unknown), Jacobian (T, 3, GLOBAL + 3) of the model, and axes (T, 3, 3)."""
-    place, axes, place_rate, axes_rate, known = track.pose_before(float(shared[0]))
+    """Residual (F, 3) [m] (NaN where unknown), Jacobian (F, 3, GLOBAL + 3) of the model, and axes (F, 3, 3)."""
+    place, axes, place_rate, axes_rate, known = track.pose_before(float(shared[0]), track.used)
     turn = (1.0 + float(shared[1])) * rotation_matrix(shared[TURN])
     true = place + axes @ lever
     away = true - center
@@ -64,7 +65,7 @@ def residuals(track: HeldTrack, lever: Array, shared: Array, center: Array) -> t
     )  # turn x seen, column by column
     jacobian[:, :, SHIFT] = np.eye(3)
     jacobian[:, :, GLOBAL:] = turn @ axes
-    residual = track.measured - (center + seen + shared[SHIFT])
+    residual = track.measured[track.used] - (center + seen + shared[SHIFT])
     residual[np.logical_not(known)] = np.nan
     return residual, jacobian, turn @ axes
 
@@ -86,20 +87,18 @@ def normal_equations(
         w = np.full(len(r), 1.0 / noise**2)
         if slide_axis is None:
             w *= np.minimum(1.0, HUBER * noise / np.maximum(size, 1e-12))
-        full = np.zeros((len(r), 3, q))
-        full[:, :, :GLOBAL] = j[:, :, :GLOBAL]
-        full[:, :, GLOBAL + 3 * k : GLOBAL + 3 * k + 3] = j[:, :, GLOBAL:]
-        weighted = full * w[:, None, None]
-        matrix += np.einsum("tcq,tcp->qp", weighted, full)
-        gradient += np.einsum("tcq,tc->q", weighted, r)
-        misfit += float((w[:, None] * r * r).sum())
+        place = np.r_[0:GLOBAL, GLOBAL + 3 * k : GLOBAL + 3 * k + 3]  # what this particle depends on
+        weighted = (j * w[:, None, None]).reshape(-1, GLOBAL + 3)
+        matrix[np.ix_(place, place)] += weighted.T @ j.reshape(-1, GLOBAL + 3)
+        gradient[place] += weighted.T @ r.ravel()
+        misfit += float(w @ (r * r).sum(axis=1))
         count += r.size
         if knots:
-            hats = slide_hats(track.time[good], knots)
+            hats = slide_hats(track.time[track.used][good], knots)
             shape = axes[good][:, :, slide_axis]  # (T, 3)
-            own += np.einsum("tj,ti,t->ji", hats, hats, w)
-            across += np.einsum("tj,tc,tcq,t->jq", hats, shape, full, w, optimize=True)
-            pull += np.einsum("tj,tc,tc,t->j", hats, shape, r, w)
+            own += (hats * w[:, None]).T @ hats
+            across[:, place] += (hats * w[:, None]).T @ (shape[:, None, :] @ j)[:, 0]
+            pull += hats.T @ (w * (shape * r).sum(axis=1))
     if not knots:
         return Normal(matrix, gradient, misfit, count)
     both = np.linalg.solve(own, np.concatenate((pull[:, None], across), axis=1)).astype(np.float64)
@@ -118,10 +117,14 @@ def slide_hats(time: Array, knots: int) -> Array:
 
 
 def typical_noise(episodes: list[list[HeldTrack]], ids: list[int], at: Point, center: Array) -> float:
-    """Deviation of a coordinate [m] at the point, from the median (robust), at least FINEST."""
+    """Deviation of a coordinate [m] at the point, from the median (robust) of some frames, at least FINEST."""
     sizes = []
+    turn = (1.0 + float(at.shared[1])) * rotation_matrix(at.shared[TURN])
     for tracks in episodes:
         for track in tracks:
-            residual, _, _ = residuals(track, at.levers[ids.index(track.id)], at.shared, center)
-            sizes.append(np.abs(residual[np.isfinite(residual)]))
+            some = track.used[::GLANCE]
+            place, axes, _, _, known = track.pose_before(float(at.shared[0]), some)
+            away = place + axes @ at.levers[ids.index(track.id)] - center
+            residual = track.measured[some] - (center + away @ turn.T + at.shared[SHIFT])
+            sizes.append(np.abs(residual[known]).ravel())
     return max(1.4826 * float(np.median(np.concatenate(sizes))), FINEST) if sizes else FINEST

@@ -22,6 +22,7 @@ LEVER_PRIOR = 1.0  # [m]
 KNOWN_LEVER = 5e-4  # [m] deviation of a lever that the twin stores
 FIXED = 1e-9
 DELAYS = np.arange(-0.1, 0.41, 0.02)  # [s] where the fit may start
+CLOSE = 1e-5  # [s], 1, [rad], [m]: a step this small ends the rounds
 ROUNDS = 6  # Gauss-Newton steps; four are enough for 0.25 s of delay
 
 
@@ -45,6 +46,7 @@ class Joint:
         reference: list[list[HeldTrack]],
         levers: dict[int, Array] | None,
         slide_axis: int | None = None,
+        near: Joint | None = None,
     ):
         self.suspect, self.reference, self.slide_axis = suspect, reference, slide_axis
         self.ids = sorted({t.id for e in suspect + reference for t in e})
@@ -53,7 +55,7 @@ class Joint:
         self.center = places.mean(axis=0)
         self.unknowns = GLOBAL + 3 * len(self.ids) + CHANGES
         self._prior = self._deviations()
-        self._linearise()
+        self._linearise(near)
 
     @property
     def episodes(self) -> int:
@@ -108,8 +110,8 @@ class Joint:
                     levers[k] = KNOWN_LEVER
         return np.concatenate((base, levers.ravel(), PRIOR))
 
-    def _linearise(self) -> None:
-        """Gauss-Newton with every change free, from the best of a few delays."""
+    def _linearise(self, near: Joint | None) -> None:
+        """Gauss-Newton with every change free, from the point of a fit `near`, else from the best of a few delays."""
         k = len(self.ids)
         self.at = np.zeros(self.unknowns)
         levers = np.zeros((k, 3))
@@ -125,7 +127,10 @@ class Joint:
             levers[i] = np.nanmedian(np.concatenate(own), axis=0)
         self.at[GLOBAL : GLOBAL + 3 * k] = levers.ravel()
         self._mean = self.at.copy()
-        self.at[-CHANGES] = self._first_delay()
+        if near is None:
+            self.at[-CHANGES] = self._first_delay()
+        else:
+            self.at = near.at.copy()
         for _ in range(ROUNDS):
             self._refresh()
             free = np.ones(CHANGES, bool)
@@ -138,6 +143,8 @@ class Joint:
             limit[[0, -CHANGES]] = 0.1  # [s]
             limit[[1, 1 - CHANGES]] = 0.2
             self.at = self.at + np.clip(step, -limit, limit)
+            if np.abs(step).max() < CLOSE:
+                break
         self._refresh()
 
     def _first_delay(self) -> float:

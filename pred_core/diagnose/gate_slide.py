@@ -29,7 +29,7 @@ def find_slide(joint: Joint, axis: int | None = None) -> Slide:
     """The sliding of the suspect episodes of `joint`, which itself knows no sliding."""
     tried = []
     for k in range(3) if axis is None else (axis,):
-        own = Joint(joint.suspect, joint.reference, joint.known, k)
+        own = Joint(joint.suspect, joint.reference, joint.known, k, near=joint)
         free = np.ones(CHANGES, bool)
         free[OFFSET] = own.offset_known
         fit = own.fit(free)

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from pred_core.types import Array, Episode
 
+FRAMES = 150  # compared in an episode; errors of neighbouring frames are alike, more would add little
+
 
 @dataclass(frozen=True)
 class HeldTrack:
@@ -21,13 +23,16 @@ class HeldTrack:
     axes: Array  # (T, 3, 3) world_from_gripper
     place_rate: Array  # (T, 3) [m/s]
     axes_rate: Array  # (T, 3, 3) [1/s]
+    used: NDArray[np.int64]  # (F,) the frames that are compared: seen, and no more than FRAMES of them
 
-    def pose_before(self, delay: float) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
-        """Place, axes, their rates, and where they are known (T,), `delay` [s] before every stamp.
+    def pose_before(
+        self, delay: float, frames: NDArray[np.int64]
+    ) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
+        """Place, axes, their rates, and where they are known (F,), `delay` [s] before `frames` (F,).
 
         Cubic Hermite interpolation; axes stay orthonormal to within the square of the turn between frames.
         """
-        at = self.time - delay
+        at = self.time[frames] - delay
         known = (at >= self.time[0]) & (at <= self.time[-1])
         k = np.clip(np.searchsorted(self.time, at, side="right"), 1, len(self.time) - 1)
         step = self.time[k] - self.time[k - 1]
@@ -49,7 +54,8 @@ def held_tracks(episode: Episode) -> list[HeldTrack]:
             continue
         seen = episode.tracks.visible[:length, column]
         measured = np.where(seen[:, None], episode.position[:length, column], np.nan)
-        if np.isfinite(measured).all(axis=1).sum() < 2:
+        used = np.flatnonzero(np.isfinite(measured).all(axis=1))
+        if len(used) < 2:
             continue
         place = episode.grips.position[:length, gripper].double().numpy()
         axes = rotation_matrices(episode.grips.rotation[:length, gripper].double().numpy())
@@ -63,6 +69,7 @@ def held_tracks(episode: Episode) -> list[HeldTrack]:
                 axes=axes,
                 place_rate=np.gradient(place, t, axis=0),
                 axes_rate=np.gradient(axes, t, axis=0),
+                used=used[:: max(1, len(used) // FRAMES)],
             )
         )
     return tracks
