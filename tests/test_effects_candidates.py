@@ -101,6 +101,14 @@ def test_obstacle_carries_what_lies_on_it_and_does_not_bounce() -> None:
     assert float(x[-1, 1, 2]) < -10.0  # beside the ball nothing holds
 
 
+def test_obstacle_rubs() -> None:
+    # 1 cm deep: p = 200^2 (0.01 - 0.0015) = 340 m/s^2 and mu p = 170 m/s^2 against a slide of 2 m/s, which the onset
+    # over 170 / 200 m/s weakens to 170 * 2 / 2.85 = 119.3 m/s^2.
+    ball = one("obstacle", radius=0.1, center=(1.0, 0.0, 0.0), friction=0.5)
+    _, after = flown(ball, [[1.0, 0.0, 0.09], [0.0, 0.0, 0.0]], [[2.0, 0.0, 0.0], [0.0] * 3], 1, substeps=1)
+    assert after.velocity[0].tolist() == pytest.approx([2.0 - 1.19298, 0.0, 3.4], rel=1e-4)
+
+
 # Sliding from 1 m/s stops after v^2 / 2 mu g; of friction c N v alone, after v / c g. Semi-implicit Euler moves with
 # the speed after each step: h v / 2 = 0.25 mm less, and h v = 0.5 mm less.
 STOPS: list[tuple[str, dict[str, float | tuple[float, ...]], float, float, float, float]] = [
@@ -206,8 +214,8 @@ PLANTED: dict[str, tuple[Values, Values]] = {
         {"stiffness": (0.2,), "arc": (0.75,), "anchor": (0.2, 0.2, -0.2), "length": (0.2,)},
     ),
     "obstacle": (
-        {"radius": (0.08,), "center": (0.22, 0.05, -0.25)},
-        {"radius": (0.06,), "center": (0.24, 0.04, -0.23)},
+        {"radius": (0.08,), "center": (0.3, 0.05, -0.15), "friction": (0.3,)},
+        {"radius": (0.06,), "center": (0.32, 0.04, -0.13), "friction": (0.5,)},
     ),
     "friction_scale": ({"change": (0.5,)}, {"change": (0.0,)}),
     "friction_viscous": ({"coefficient": (2.0,)}, {"coefficient": (0.0,)}),

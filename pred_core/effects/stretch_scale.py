@@ -9,7 +9,10 @@ from pred_core.effects.effect import Effect, Parameter, SpringContext
 
 
 class StretchScale(Effect):
-    """Tension k (1 + a) e, e the strain. With a <= 3/2 the substeps chosen for k have room, also for `StrainStiffening`."""
+    """Tension k (1 + a) e, e the strain.
+
+    Up to a = 3/2 the margin of the substeps chosen for k has room, for `StrainStiffening` besides.
+    """
 
     id = "stretch_scale"
     family = "stretch"
