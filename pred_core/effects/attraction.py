@@ -21,7 +21,7 @@ class Attraction(Effect):
     hooks = ("force",)
     parameters = (
         Parameter("strength", "m/s^2", -20.0, 20.0, typical=0.5, doc="a, the largest acceleration"),
-        Parameter("center", "m", -5.0, 5.0, size=3, typical=0.1, doc="the place in world"),
+        Parameter("center", "m", -5.0, 5.0, size=3, typical=0.1, scan="place", doc="the place in world"),
         Parameter("range", "m", 0.03, 0.5, null=0.15, typical=0.3, log=True, doc="r, where the force is largest"),
     )
     confounded_with = ("tether", "obstacle", "wind")

@@ -17,7 +17,7 @@ class BendingRegion(Effect):
     hooks = ("bend_stiffness",)
     parameters = (
         Parameter("change", "1", -0.95, 30.0, typical=1.0, doc="a, relative change in the middle of the piece"),
-        Parameter("center", "1", 0.0, 1.0, null=0.5, typical=0.1, doc="s0, material coordinate of the piece"),
+        Parameter("center", "1", 0.0, 1.0, null=0.5, typical=0.1, scan="arc", doc="s0, the middle of the piece"),
         Parameter("width", "1", 0.02, 0.5, null=0.1, typical=0.3, log=True, doc="w, standard deviation of the bell"),
     )
     confounded_with = ("bending_scale", "bending_gradient", "bending_profile")

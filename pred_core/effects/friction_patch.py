@@ -17,7 +17,7 @@ class FrictionPatch(Effect):
     hooks = ("contact",)
     parameters = (
         Parameter("change", "1", -1.0, 30.0, typical=1.0, doc="a, relative change in the centre"),
-        Parameter("center", "m", -5.0, 5.0, size=2, typical=0.1, doc="x and y in world"),
+        Parameter("center", "m", -5.0, 5.0, size=2, typical=0.1, scan="floor", doc="x and y in world"),
         Parameter("radius", "m", 0.02, 0.5, null=0.08, typical=0.3, log=True, doc="r, standard deviation of the bell"),
     )
     confounded_with = ("friction_scale", "friction_anisotropic", "obstacle")

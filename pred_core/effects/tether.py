@@ -24,8 +24,8 @@ class Tether(Effect):
     hooks = ("force",)
     parameters = (
         Parameter("stiffness", "N/m", 0.0, 100.0, typical=0.2, doc="k of the thread"),
-        Parameter("arc", "1", 0.0, 1.0, null=0.75, typical=0.1, doc="material coordinate of the tied point"),
-        Parameter("anchor", "m", -5.0, 5.0, size=3, typical=0.1, doc="in world"),
+        Parameter("arc", "1", 0.0, 1.0, null=0.75, typical=0.1, scan="arc", doc="material coordinate it is tied to"),
+        Parameter("anchor", "m", -5.0, 5.0, size=3, typical=0.1, scan="place", doc="in world"),
         Parameter("length", "m", 0.0, 3.0, null=0.2, typical=0.1, doc="L, where it becomes taut"),
     )
     confounded_with = ("attraction", "gravity_offset")

@@ -19,7 +19,7 @@ class Wind(Effect):
     hooks = ("force",)
     parameters = (
         Parameter("coefficient", "1/m", 0.0, 10.0, typical=0.1, doc="b, drag per mass and squared speed"),
-        Parameter("velocity", "m/s", -20.0, 20.0, size=2, typical=2.0, doc="w along x and y of the world"),
+        Parameter("velocity", "m/s", -20.0, 20.0, size=2, typical=2.0, scan="direction", doc="w along world x and y"),
     )
     confounded_with = ("drag_quadratic", "gravity_offset", "attraction")
 
