@@ -1,0 +1,105 @@
+"""The gripper as a measurement: where it holds the object, the object moves with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pred_core.config import setting
+from pred_core.errors import InputError
+from pred_core.types import Array
+
+KEPT = 2_000_000_000  # [ns] of gripper poses
+
+
+@dataclass(frozen=True)
+class GraspConfig:
+    """How a grasp binds."""
+
+    radius: float = setting(0.03, unit="m", low=0.0, high=0.3, doc="particles this near to a closing gripper are held")
+    sigma: float = setting(0.0015, unit="m", low=1e-4, high=0.05, doc="of a held particle in the gripper's frame")
+    slip: float = setting(0.02, unit="m", low=1e-3, high=0.3, doc="seen this far off, it has slipped out")
+
+
+class GripperPath:
+    """Measured gripper poses, looked up at capture times."""
+
+    def __init__(self) -> None:
+        self._stamps: list[int] = []
+        self._poses: list[tuple[Array, Array]] = []
+        self.closed: NDArray[np.bool_] = np.zeros(0, bool)
+
+    def add(self, stamp: int, position: Array, rotation: Array) -> None:
+        """Poses (G, 3) [m] and (G, 4) wxyz at `stamp` [ns]. Raises: InputError if not finite."""
+        if not (np.isfinite(position).all() and np.isfinite(rotation).all()):
+            raise InputError("gripper pose is not finite", next_step="Check the source of gripper/pose")
+        if self._stamps and (stamp < self._stamps[-1] or position.shape != self._poses[-1][0].shape):
+            self._stamps, self._poses = [], []  # a new recording
+        if self._stamps and stamp == self._stamps[-1]:
+            return
+        self._stamps.append(stamp)
+        self._poses.append((np.asarray(position, float), _matrices(np.asarray(rotation, float))))
+        while self._stamps[-1] - self._stamps[0] > KEPT:
+            del self._stamps[0], self._poses[0]
+
+    def at(self, stamp: int, late: float = 0.1) -> tuple[Array, Array] | None:
+        """Position (G, 3) and rotation matrices (G, 3, 3) at `stamp` [ns]: linear between poses, the newest one for
+        `late` [s] after it, else None."""
+        if not self._stamps or stamp < self._stamps[0] or (stamp - self._stamps[-1]) * 1e-9 > late:
+            return None
+        after = int(np.searchsorted(self._stamps, stamp))
+        if after == 0 or after == len(self._stamps):
+            return self._poses[min(after, len(self._stamps) - 1)]
+        before, next_ = self._poses[after - 1], self._poses[after]
+        share = (stamp - self._stamps[after - 1]) / (self._stamps[after] - self._stamps[after - 1])
+        blend = (1 - share) * before[1] + share * next_[1]
+        u, _, v = np.linalg.svd(blend)
+        return (1 - share) * before[0] + share * next_[0], u @ v
+
+
+class Grasp:
+    """Which particles each gripper holds, in its own frame."""
+
+    def __init__(self, config: GraspConfig):
+        self.config = config
+        self.held: NDArray[np.int64] = np.zeros(0, np.int64)  # (P,) gripper or -1
+        self._local: Array = np.zeros((0, 3))
+
+    def bind(self, position: Array, poses: tuple[Array, Array] | None, closed: NDArray[np.bool_]) -> None:
+        """Hold the particles (P, 3) [m] that are near to closed grippers now, and no others."""
+        self.held = np.full(len(position), -1, np.int64)
+        self._local = np.zeros_like(position)
+        if poses is None:
+            return
+        for gripper, (place, turn) in enumerate(zip(*poses, strict=True)):
+            if gripper >= len(closed) or not closed[gripper]:
+                continue
+            near = (np.linalg.norm(position - place, axis=-1) < self.config.radius) & (self.held < 0)
+            self.held[near] = gripper
+            self._local[near] = (position[near] - place) @ turn
+
+    def targets(self, poses: tuple[Array, Array] | None) -> tuple[NDArray[np.int64], Array]:
+        """Held particles and where they are (H, 3) [m] now."""
+        held = np.flatnonzero(self.held >= 0)
+        if poses is None or not len(held):
+            return np.zeros(0, np.int64), np.zeros((0, 3))
+        place, turn = poses
+        index = self.held[held]
+        return held, place[index] + np.einsum("hab,hb->ha", turn[index], self._local[held])
+
+    def release(self) -> None:
+        """Hold nothing."""
+        self.held = np.full_like(self.held, -1)
+
+
+def _matrices(q: Array) -> Array:
+    """Rotation matrices (G, 3, 3) of unit quaternions (G, 4) wxyz."""
+    w, x, y, z = q.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)

@@ -1,0 +1,250 @@
+"""A line object followed through time: start, predict, fit, notice when lost, start again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pred_core.config import setting
+from pred_core.track.estimate import Estimate, Prior, Status, trace_confidence
+from pred_core.track.grasp import Grasp, GraspConfig
+from pred_core.track.line_fit import SURFACE, Anchors, Cloud, LineFit, LineFitConfig, fit_line
+from pred_core.track.line_start import LineStartConfig, find_line, resample
+from pred_core.track.view import View
+from pred_core.types import Array, Tracks
+
+Poses = tuple[Array, Array]
+WIDTH_OF_UNIFORM = np.sqrt(3.0)  # half width over standard deviation of points spread evenly over a width
+OBSTACLE = 0.015  # [m] before a node, beyond errors of depth and of the fit
+SAME_TIME = 10_000_000  # [ns]
+STILL = 0.005  # [m] standard deviation of the motion prior of a particle in view, beside its acceleration
+
+
+@dataclass(frozen=True)
+class LineConfig:
+    """What is known of the line, and how it is followed."""
+
+    length: float = setting(0.0, unit="m", low=0.0, high=20.0, doc="0: measured when it is found")
+    radius: float = setting(0.0, unit="m", low=0.0, high=0.1, doc="0: measured when it is found")
+    particles: int = setting(61, low=4, high=400, doc="nodes, evenly along the line; ids count from end 0")
+    points: int = setting(600, low=50, high=20000, doc="most points used of one camera")
+    acceleration: float = setting(10.0, unit="m/s^2", low=0.1, high=1000.0, doc="that the motion prior allows for")
+    bridge: float = setting(0.08, unit="m", low=0.0, high=0.5, doc="longest end hidden in a gripper's jaws")
+    seen: float = setting(1.5, low=0.1, high=100.0, doc="points of one camera at a particle that make it visible")
+    doubt: float = setting(0.9, low=0.0, high=1.0, doc="share of points explained less nodes contradicted; below, look anew")
+    lost: float = setting(0.5, low=0.0, high=1.0, doc="share of the points on the line below which it is lost")
+    patience: float = setting(0.4, unit="s", low=0.0, high=10.0, doc="how long before it is searched anew")
+    tolerance: float = setting(0.15, low=0.01, high=1.0, doc="relative difference of length when it is found again")
+    fit: LineFitConfig = LineFitConfig()
+    start: LineStartConfig = LineStartConfig()
+    grasp: GraspConfig = GraspConfig()
+
+
+class LineTracker:
+    """Holds the line's nodes. Ids and arc length stay with the nodes, also when it is lost and found."""
+
+    def __init__(self, config: LineConfig):
+        self.config = config
+        self.length, self.radius = config.length, config.radius
+        self.grasp = Grasp(config.grasp)
+        self.stamp = 0  # [ns] of the nodes
+        self.nodes: Array | None = None  # (N, 3) [m] world
+        self.velocity: Array = np.zeros((config.particles, 3))
+        self._variance: Array = np.zeros(config.particles)  # (N,) [m^2] of the prediction
+        self._bad_since: int | None = None
+        self._closed: NDArray[np.bool_] = np.zeros(0, bool)
+
+    @property
+    def spacing(self) -> float:
+        """Arc length between nodes [m]."""
+        return self.length / (self.config.particles - 1)
+
+    def start(self, views: Sequence[View], stamp: int, poses: Poses | None, closed: NDArray[np.bool_]) -> list[View]:
+        """Look for the line. Returns the part of each view that is on it; nothing if it is not found."""
+        found = find_line(np.concatenate([v.points for v in views]), self.config.start)
+        if found is None:
+            return []
+        path = self._oriented(found.path, poses, closed)
+        known = self.length > 0.0
+        cuts = np.cumsum([len(v.pixel) for v in views])[:-1]
+        members = [v.select(m) for v, m in zip(views, np.split(found.member, cuts), strict=True)]
+        nodes = resample(path, self.config.particles)
+        radius = self.config.radius or _radius(members, nodes)
+        cloud = self._cloud(members, stamp, radius)
+        nodes, length = _settle(nodes, cloud, radius, self.config, self.length if known else None)
+        if known and abs(length - self.length) > self.config.tolerance * self.length:
+            return []
+        self.length = self.length if known else length
+        self.radius, self.nodes, self.stamp = radius, nodes, stamp
+        self.velocity = np.zeros_like(nodes)
+        self._variance = np.full(len(nodes), STILL**2)
+        self._bad_since, self._closed = None, closed
+        self.grasp.bind(nodes, poses, closed)
+        return members
+
+    def update(
+        self,
+        views: Sequence[View],
+        stamp: int,
+        poses: Poses | None,
+        prior: Prior | None = None,
+    ) -> Estimate:
+        """Follow the line to `stamp` [ns]. `prior` is used instead of constant velocity."""
+        assert self.nodes is not None  # `start` has succeeded; the caller's bug otherwise
+        dt = max((stamp - self.stamp) * 1e-9, 0.0)
+        expected, sigma = self._predict(dt, stamp, poses, prior)
+        information = np.eye(3) / (sigma**2)[:, None, None]
+        held, place = self.grasp.targets(poses)
+        information[held] = np.eye(3) / self.config.grasp.sigma**2
+        expected[held] = place
+        cloud = self._cloud([_near(v, expected, self.config.fit.reach) for v in views], stamp, self.radius)
+        fit = fit_line(
+            expected, self.spacing, cloud, self.radius, self.config.fit, Anchors(expected, information), self.velocity
+        )
+        score = fit.explained - _contradicted(views, fit)
+        if score < self.config.doubt:
+            fit = self._second_opinion(fit, score, views, stamp, poses)
+        visible = fit.views.max(axis=0, initial=0.0) >= self.config.seen
+        self._advance(fit, dt, visible, sigma)
+        self.stamp = stamp
+        return self._estimate(fit, visible, self._judge(fit, views, stamp), tuple(v.camera for v in views))
+
+    def _second_opinion(
+        self, fit: LineFit, score: float, views: Sequence[View], stamp: int, poses: Poses | None
+    ) -> LineFit:
+        """A fit from scratch, if it explains the pictures better than the one that followed the motion."""
+        found = find_line(np.concatenate([v.points for v in views]), self.config.start)
+        if found is None or abs(found.length - self.length) > self.config.tolerance * self.length:
+            return fit
+        nodes = resample(self._oriented(found.path, poses, self._closed), self.config.particles)
+        held, place = self.grasp.targets(poses)
+        information, target = np.zeros((len(nodes), 3, 3)), nodes.copy()
+        information[held], target[held] = np.eye(3) / self.config.grasp.sigma**2, place
+        cloud = self._cloud(views, stamp, self.radius)
+        anew = fit_line(nodes, self.spacing, cloud, self.radius, self.config.fit, Anchors(target, information))
+        return anew if anew.explained - _contradicted(views, anew) > score + 0.02 else fit
+
+    def _predict(self, dt: float, stamp: int, poses: Poses | None, prior: Prior | None) -> tuple[Array, Array]:
+        """Expected nodes (N, 3) [m] and their standard deviation (N,) [m]."""
+        assert self.nodes is not None
+        expected = self.nodes + self.velocity * dt
+        sigma = np.sqrt(self._variance + (0.5 * self.config.acceleration * dt**2) ** 2)
+        if prior is not None:
+            later = (stamp - prior.stamp) * 1e-9
+            known = prior.id < len(expected)
+            index = prior.id[known].astype(int)
+            expected[index] = prior.position[known] + later * prior.velocity[known]
+            sigma[index] = prior.sigma
+        return expected, sigma
+
+    def _advance(self, fit: LineFit, dt: float, visible: NDArray[np.bool_], sigma: Array) -> None:
+        """Velocity and variance of the next prediction."""
+        assert self.nodes is not None
+        if dt > 0:
+            measured = (fit.nodes - self.nodes) / dt
+            blend = np.where(visible, 0.7, 0.3)[:, None]
+            self.velocity = (1.0 - blend) * self.velocity + blend * measured
+        grown = np.minimum(sigma**2, 0.1**2)
+        self._variance = np.where(visible, STILL**2, grown)
+        self.nodes = fit.nodes
+
+    def _judge(self, fit: LineFit, views: Sequence[View], stamp: int) -> Status:
+        """Lost is what explains too few of the candidates near and far for too long."""
+        total = sum(len(v.pixel) for v in views)
+        bad = total > 0 and fit.explained < self.config.lost
+        if not bad:
+            self._bad_since = None
+            return "tracking"
+        self._bad_since = stamp if self._bad_since is None else self._bad_since
+        return "lost" if (stamp - self._bad_since) * 1e-9 >= self.config.patience else "tracking"
+
+    def _estimate(self, fit: LineFit, visible: NDArray[np.bool_], status: Status, cameras: tuple[str, ...]) -> Estimate:
+        count = self.config.particles
+        confidence = trace_confidence(fit.covariance, visible)
+        tracks = Tracks(np.int64(self.stamp), fit.nodes.copy(), np.arange(count, dtype=np.uint32), visible, confidence)  # type: ignore[arg-type]
+        return Estimate(tracks, fit.covariance, self.velocity.copy(), status, fit.residual, cameras)
+
+    def _cloud(self, views: Sequence[View], stamp: int, radius: float) -> Cloud:
+        """At most `points` of each view, moved from the surface onto the centreline."""
+        picked = [v.select(np.arange(0, len(v.pixel), max(1, -(-len(v.pixel) // self.config.points)))) for v in views]
+        rays = np.concatenate([v.rays for v in picked])
+        return Cloud(
+            np.concatenate([v.points for v in picked]) + SURFACE * radius * rays,
+            rays,
+            np.concatenate([v.depth for v in picked]),
+            np.concatenate([np.full(len(v.pixel), i) for i, v in enumerate(picked)]),
+            np.concatenate([np.full(len(v.pixel), (stamp - v.stamp) * 1e-9) for v in picked]),
+        )
+
+    def _oriented(self, path: Array, poses: Poses | None, closed: NDArray[np.bool_]) -> Array:
+        """End 0 is where it was before; at first the end nearest to a closed gripper, else the one of smaller x."""
+        if self.nodes is not None:
+            there = resample(path, len(self.nodes))
+            away, swapped = (float(np.abs(p - self.nodes).sum()) for p in (there, there[::-1]))
+            return path if away <= swapped else path[::-1]
+        grips = np.zeros((0, 3)) if poses is None else poses[0][: len(closed)][closed[: len(poses[0])]]
+        if not len(grips):
+            return path if path[0, 0] <= path[-1, 0] else path[::-1]
+        ends = np.linalg.norm(path[[0, -1]][:, None] - grips[None], axis=-1)  # (2, G)
+        path = path if ends[0].min() <= ends[1].min() else path[::-1]
+        for gripper in grips[:2]:  # the jaws hide the end of what they hold
+            for end in (0, -1):
+                gap = float(np.linalg.norm(path[end] - gripper))
+                if self.config.start.voxel < gap < self.config.bridge:
+                    path = np.concatenate([gripper[None], path] if end == 0 else [path, gripper[None]])
+        return path
+
+
+def _contradicted(views: Sequence[View], fit: LineFit) -> float:
+    """Share of the nodes where no camera sees the line although nothing stands before it."""
+    found = np.zeros(len(fit.nodes), bool)
+    newest = max((v.stamp for v in views), default=0)
+    for view in views:
+        if newest - view.stamp < SAME_TIME:  # an older picture may have been true
+            found |= view.unobstructed(fit.nodes, OBSTACLE)
+    return float((found & (fit.support == 0)).mean())
+
+
+def _near(view: View, nodes: Array, reach: float) -> View:
+    """The points within the box around the nodes, `reach` [m] wider."""
+    low, high = nodes.min(axis=0) - reach, nodes.max(axis=0) + reach
+    keep = ((view.points >= low) & (view.points <= high)).all(axis=-1)
+    return view if keep.all() else view.select(keep)
+
+
+def _settle(nodes: Array, cloud: Cloud, radius: float, config: LineConfig, length: float | None) -> tuple[Array, float]:
+    """Fit from a rough path; without a given length the line takes the one its points have."""
+    total = length
+    for _ in range(8):
+        edge = np.linalg.norm(np.diff(nodes, axis=0), axis=-1)
+        spacing = (float(edge.sum()) if total is None else total) / (len(nodes) - 1)
+        fit = fit_line(nodes, spacing, cloud, radius, config.fit, iterations=3)
+        nodes = fit.nodes if total is not None else resample(fit.nodes, len(nodes))
+    return nodes, float(np.linalg.norm(np.diff(nodes, axis=0), axis=-1).sum())
+
+
+def _radius(views: Sequence[View], nodes: Array) -> float:
+    """Radius [m] from how wide the line looks: half its width in the camera that sees most of it, from the spread."""
+    from scipy.spatial import cKDTree
+
+    along = np.gradient(nodes, axis=0)
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    widest = 0.0
+    for view in views:
+        if len(view.pixel) < 50:
+            continue
+        distance, near = cKDTree(nodes).query(view.points)
+        across = np.cross(along[near], view.rays)
+        size = np.linalg.norm(across, axis=-1)
+        usable = (size > 0.3) & (distance < 0.03)
+        if usable.sum() < 50:
+            continue
+        off = np.einsum("ma,ma->m", view.points - nodes[near], across)[usable] / size[usable]
+        for index in np.unique(near[usable]):  # the rough path may run beside the middle
+            at = near[usable] == index
+            off[at] -= off[at].mean()
+        widest = max(widest, float(WIDTH_OF_UNIFORM * off.std()))
+    return widest

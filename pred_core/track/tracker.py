@@ -1,0 +1,141 @@
+"""The tracker: pictures of any number of cameras in, particles out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pred_core.config import setting
+from pred_core.errors import ConfigError, InputError, nearest
+from pred_core.track.estimate import Estimate, Prior
+from pred_core.track.grasp import GripperPath
+from pred_core.track.line_tracker import LineConfig, LineTracker
+from pred_core.track.mask import ObjectMask
+from pred_core.track.view import View, check_frame
+from pred_core.track.workspace import Shape, Workspace, check_workspace
+from pred_core.types import Array, CameraFrame, Capsule
+
+MOST_CAMERAS = 8
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """What is tracked, where, and for how long a picture counts."""
+
+    kind: str = setting("line", choices=("line", "sheet", "volume"), doc="geometry class of the object")
+    window: float = setting(0.12, unit="s", low=0.0, high=2.0, doc="a picture older than the newest by more is stale")
+    arm_radius: float = setting(0.0, unit="m", low=0.0, high=0.3, doc="of the arm above each gripper; 0: none in view")
+    arm_start: float = setting(0.05, unit="m", low=-0.5, high=0.5, doc="from the tool centre along the gripper's +z")
+    arm_end: float = setting(0.4, unit="m", low=-0.5, high=2.0, doc="from the tool centre along the gripper's +z")
+    workspace: Workspace = Workspace()
+    line: LineConfig = LineConfig()
+
+
+class Tracker:
+    """Online and causal. Feed `add_frame` in any order; `step` takes what is new."""
+
+    def __init__(self, config: TrackerConfig, cameras: Sequence[str]):
+        """Raises: ConfigError for no camera, more than eight, or an empty workspace."""
+        if not 1 <= len(set(cameras)) == len(cameras) <= MOST_CAMERAS:
+            raise ConfigError(
+                "tracker: cameras",
+                got=", ".join(cameras) or "none",
+                allowed=f"1 to {MOST_CAMERAS}, each once",
+                next_step="Name them, e.g. cameras:=cam0,cam1",
+            )
+        check_workspace(config.workspace)
+        self.config, self.cameras = config, tuple(cameras)
+        self.mask = ObjectMask(config.workspace)
+        self.fixtures: tuple[Shape, ...] = ()
+        self.robot: tuple[Shape, ...] = ()
+        self.stale = 0  # pictures that came too late to be used
+        self._line = LineTracker(config.line)
+        self._path = GripperPath()
+        self._closed: NDArray[np.bool_] = np.zeros(0, bool)
+        self._frames: dict[str, CameraFrame] = {}  # new ones
+        self._views: dict[str, View] = {}  # used ones
+        self._prior: Prior | None = None
+        self._searching = True
+
+    @property
+    def searching(self) -> bool:
+        """True until the object has been found."""
+        return self._searching
+
+    @property
+    def waiting(self) -> tuple[str, ...]:
+        """Cameras whose next picture has not come."""
+        return tuple(c for c in self.cameras if c not in self._frames)
+
+    def add_grip(self, stamp: int, position: Array, rotation: Array, closed: NDArray[np.bool_]) -> None:
+        """Measured gripper poses (G, 3) [m], (G, 4) wxyz and flags (G,). Raises: InputError if not finite."""
+        self._path.add(stamp, position, rotation)
+        self._closed = closed
+
+    def set_prior(self, prior: Prior | None) -> None:
+        """Where the predictor expects the particles; used until the next one, or for `window`."""
+        self._prior = prior
+
+    def add_frame(self, camera: str, frame: CameraFrame) -> None:
+        """A new picture; an unused older one of this camera is dropped. Raises: InputError."""
+        if camera not in self.cameras:
+            raise InputError(f"unknown camera '{camera}'", next_step=nearest(camera, self.cameras))
+        check_frame(frame, camera)
+        if frame.stamp < self._line.stamp - self.config.window * 1e9:
+            self.stale += 1
+            return
+        self._frames[camera] = frame
+
+    def step(self) -> Estimate | None:
+        """Use the new pictures. None: nothing new, or the object is not found yet."""
+        if not self._frames:
+            return None
+        frames, self._frames = self._frames, {}
+        stamp = max(max(f.stamp for f in frames.values()), self._line.stamp)
+        poses = self._path.at(stamp)
+        self.mask.shapes = (*self.fixtures, *self.robot, *self._arms(poses))
+        self._views.update({c: self.mask.view(c, f) for c, f in frames.items()})
+        oldest = stamp - self.config.window * 1e9
+        self._views = {c: v for c, v in self._views.items() if v.stamp >= oldest}
+        views = [self._views[c] for c in self.cameras if c in self._views]
+        if self._searching and not self._find(views, frames, stamp, poses):
+            return None
+        prior = self._prior if self._prior is not None and abs(stamp - self._prior.stamp) * 1e-9 < 0.5 else None
+        estimate = self._line.update(views, stamp, poses, prior)
+        if estimate.status == "lost":
+            self._searching = True
+        return estimate
+
+    def reset(self) -> None:
+        """Forget the object; it is searched in the next pictures."""
+        self._line = LineTracker(self.config.line)
+        self.mask.color = None
+        self._frames, self._views, self._searching = {}, {}, True
+
+    def _find(
+        self, views: list[View], frames: dict[str, CameraFrame], stamp: int, poses: tuple[Array, Array] | None
+    ) -> bool:
+        if not any(len(v.pixel) for v in views):
+            return False
+        members = self._line.start(views, stamp, poses, self._closed)
+        if not members:
+            return False
+        if self.mask.color is None:
+            pairs = [(frames[m.camera], m.pixel) for m in members if m.camera in frames]
+            self.mask.learn([f for f, _ in pairs], [p for _, p in pairs])
+        self._searching = False
+        return True
+
+    def _arms(self, poses: tuple[Array, Array] | None) -> tuple[Shape, ...]:
+        """The arm as a capsule above each gripper."""
+        c = self.config
+        if poses is None or c.arm_radius == 0.0:
+            return ()
+        shapes = []
+        for place, turn in zip(*poses, strict=True):
+            start, end = (tuple((place + turn[:, 2] * d).tolist()) for d in (c.arm_start, c.arm_end))
+            shapes.append(Capsule(start, end, c.arm_radius))
+        return tuple(shapes)
