@@ -42,7 +42,7 @@ class Tracks:
     """Tracked particles of one instant, or of T instants with a leading axis T."""
 
     stamp: NDArray[np.int64]  # () or (T,) [ns] capture time
-    position: Array  # (P, 3) or (T, P, 3) [m] world; NaN where never measured
+    position: Array  # (P, 3) or (T, P, 3) [m] world; NaN where not measured, or an estimate, not visible
     id: NDArray[np.uint32]  # (P,) persistent particle id
     visible: NDArray[np.bool_]  # (P,) or (T, P)
     confidence: NDArray[np.float32]  # (P,) or (T, P), 0 to 1

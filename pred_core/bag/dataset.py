@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from pred_core.bag.episode import read_episode
+from pred_core.bag.unseen import complete_line
 from pred_core.config import from_mapping, load_yaml, setting, to_mapping
 from pred_core.errors import ConfigError, DatasetError, nearest
 from pred_core.types import STANDARD_GRAVITY, Episode, ObjectInfo
@@ -87,8 +88,8 @@ class Dataset:
         return chosen
 
     def read(self, entry: EpisodeEntry) -> Episode:
-        """The episode of an entry. Raises: BagError."""
-        return read_episode(
+        """The episode of an entry, a line's never measured particles estimated (`complete_line`). Raises: BagError."""
+        episode = read_episode(
             self.root / entry.bag,
             name=Path(entry.bag).stem,
             object=self.object,
@@ -98,6 +99,7 @@ class Dataset:
             recording=entry.recording,
             rate=self.rate,
         )
+        return complete_line(episode, self.known)
 
     def episodes(self, split: str | None = None, entries: Iterable[EpisodeEntry] | None = None) -> Iterator[Episode]:
         """Episodes of a split (None: all), or of given entries, read one by one.

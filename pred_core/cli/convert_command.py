@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+from pred_core.bag.beam import convert_beam, read_beam
 from pred_core.bag.deform import Progress, convert_deform, read_deform
 from pred_core.bag.sample import write_sample
 
@@ -21,6 +22,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     deform.add_argument("source", type=Path, help="deform_dlo1.npz, or a folder with train/*.pkl and eval/*.pkl")
     deform.add_argument("--out", type=Path, required=True, metavar="DATASET", help="folder to write")
     deform.set_defaults(convert=_deform)
+    beam = formats.add_parser("beam", help="the released soft beam of srl-ethz/diffPD_sim2real")
+    beam.add_argument("source", type=Path, help="soft_beam.npz")
+    beam.add_argument("--load", type=int, default=0, metavar="GRAMS", help="takes with this load: 0 or 52")
+    beam.add_argument("--out", type=Path, required=True, metavar="DATASET", help="folder to write")
+    beam.set_defaults(convert=_beam)
     sample = formats.add_parser("sample", help="make the synthetic sample cable of bags/sample_cable")
     sample.add_argument("--out", type=Path, required=True, metavar="DATASET", help="folder to write")
     sample.set_defaults(convert=_sample)
@@ -38,6 +44,14 @@ def _deform(args: argparse.Namespace) -> int:
     recordings = len(set(source.recording))
     print(f"{dataset.root}: {len(dataset.entries)} episodes ({counts}) of {recordings} recordings")
     print(f"data gate: pred info {dataset.root}")
+    return 0
+
+
+def _beam(args: argparse.Namespace) -> int:
+    source = read_beam(args.source, args.load)
+    dataset = convert_beam(source, args.out, progress_line())
+    print(f"{dataset.root}: {len(dataset.entries)} episodes of {len(source.takes)} takes with {source.load} g")
+    print("between clamp and tip nothing was measured: particles there are estimated, and never scored")
     return 0
 
 

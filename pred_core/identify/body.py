@@ -52,6 +52,7 @@ def lay_out(dataset: Dataset, episodes: Sequence[Episode], config: IdentifyConfi
     mass = dataset.known.get("mass")
     physics = dataclasses.replace(Physics(), connection_threshold=shortest, max_springs=2 if edges is not None else 8)
     body = build_body(kind, rest, float(mass or config.mass), physics, id=ids, rest_length=edges, radius=config.radius)
+    body = dataclasses.replace(body, surface=np.any([e.tracks.visible.any(axis=0) for e in episodes], axis=0))
     scene = Scene(gravity=dataset.gravity, ground=config.ground)
     return Layout(body, scene, shortest, max(WIDEST * float(np.median(spacing)), 1.01 * shortest), mass is not None)
 

@@ -24,6 +24,7 @@ class Recording:
     position: Tensor  # (T, N, 3) [m] world, NaN where not measured
     grips: Grip  # leading axis T
     held: Tensor  # (T, N) int32; a gripper that has opened holds nothing more
+    estimated: Tensor | None = None  # (N,) bool: never measured, positions are estimates (`bag.unseen`); None: none
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,7 @@ def align(episode: Episode, body: Body, period: float) -> Recording:
         position=torch.as_tensor(episode.position[:, order], dtype=torch.float32),
         grips=episode.grips,
         held=torch.where(kept & (held >= 0), held, -1).to(torch.int32),
+        estimated=torch.as_tensor(~np.asarray(episode.tracks.visible.any(axis=0))[order]),
     )
 
 
@@ -145,7 +147,10 @@ def gather(recordings: Sequence[Recording], index: Tensor, steps: int, period: f
         starts.append((now, (now - last) / period, recording.held[frame]))
         before.append(recording.grips.at(frame))
         grips.append(recording.grips.span(frame + 1, frame + 1 + steps))
-        targets.append(recording.position[frame + 1 : frame + 1 + steps])
+        target = recording.position[frame + 1 : frame + 1 + steps]
+        if recording.estimated is not None:
+            target = torch.where(recording.estimated[:, None], torch.nan, target)
+        targets.append(target)
     position, velocity, held = (torch.stack(parts).to(device) for parts in zip(*starts, strict=True))
     target = torch.stack(targets, dim=1).to(device)
     seen = torch.isfinite(target).all(dim=-1)
