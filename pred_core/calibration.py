@@ -29,7 +29,6 @@ from pred_core.types import Array, Episode, Grip
 
 Three = tuple[float, float, float]
 NOTHING: Three = (0.0, 0.0, 0.0)
-OUTSIDE = 0.5  # periods beyond the first or last pose in which that pose still counts, as where bags are read
 
 
 @dataclass(frozen=True)
@@ -90,16 +89,20 @@ class Calibration:
     def correct(self, episode: Episode) -> Episode:
         """The episode as it truly was: tracks at the times they show, gripper poses at those times.
 
-        Frames for which no gripper pose is known at their true time are left out: the first ones of late tracks.
-        Raises: DatasetError if fewer than two frames are left.
+        Frames for which no gripper pose is known at their true time are left out: the first ones of late tracks, and
+        then those up to two in which everything is measured, if the episode began with such. Raises: DatasetError if
+        fewer than two frames are left.
         """
         if self.identity:
             return episode
         stamps = episode.stamps - round(self.delay * 1e9)
         kept = np.ones(len(stamps), bool)
         if self.delay:
-            slack = OUTSIDE * episode.period * 1e9
-            kept = (stamps >= episode.stamps[0] - slack) & (stamps <= episode.stamps[-1] + slack)
+            kept = (stamps >= episode.stamps[0]) & (stamps <= episode.stamps[-1])
+            whole = np.array([np.isfinite(frame).all() for frame in episode.position])
+            if whole[:2].all():
+                starts = np.flatnonzero(kept[:-1] & kept[1:] & whole[:-1] & whole[1:])
+                kept[: starts[0] if len(starts) else len(kept)] = False
         if kept.sum() < 2:
             raise DatasetError(
                 f"{episode.name}: too short for the calibration's delay",

@@ -6,6 +6,7 @@ In: tracker/points, prediction/points, player/episode. Out: /diagnostics; at the
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from pred_core.bag.wire import PREDICTION_POINTS, TRACKER_POINTS
+from pred_core.calibration import Calibration
 from pred_core.config import setting
 from pred_core.errors import ConfigError, PredError
 from pred_core.live import marks
@@ -38,7 +40,7 @@ class EvaluatorConfig:
 
     out: str = setting("out/live", doc="folder for metrics.json and report.html")
     model: str = setting("", doc="name of the predictor in metrics.json; empty: the stage of `twin`")
-    twin: str = setting("", doc="folder of the twin that predicts; names the model")
+    twin: str = setting("", doc="folder of the twin that predicts; names the model, corrects tracks")
     tolerance: float = setting(0.001, unit="s", low=0.0, high=1.0, doc="how far apart the stamps of a pair may be")
     patience: float = setting(
         10.0, unit="s", low=0.1, high=600.0, doc="wait for missing data after the end of the replay"
@@ -66,7 +68,9 @@ class EvaluatorNode(Shell):
         except OSError as error:
             raise ConfigError("parameter 'out': the folder cannot be made", got=error) from error
         config: EvaluatorConfig = self.config
-        self._model = config.model or (stage_name(Twin.load(Path(config.twin))) if config.twin else UNNAMED)
+        twin = Twin.load(Path(config.twin)) if config.twin else None
+        self._model = config.model or (UNNAMED if twin is None else stage_name(twin))
+        self._calibration = Calibration() if twin is None else twin.calibration
         self._begin_anew()
 
     def _begin_anew(self) -> None:
@@ -150,7 +154,9 @@ class EvaluatorNode(Shell):
     def _on_points(self, message: PointCloud2) -> None:
         self.diagnostics.seen(TRACKER_POINTS)
         try:
-            self._scorer.add_points(convert.cloud_to_points(message))
+            frame = convert.cloud_to_points(message)
+            true = self._calibration.correct_points(frame.position)
+            self._scorer.add_points(dataclasses.replace(frame, position=true))
             self._news = time.monotonic()
         except PredError as error:
             self._refuse(error)

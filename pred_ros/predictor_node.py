@@ -123,7 +123,7 @@ class PredictorNode(Shell):
         """Begin: a fresh Predictor, a worker, and subscriptions once enough readers listen."""
         config: PredictorConfig = self.config
         rules = Rules(max_gap=config.max_gap, horizon=config.horizon, correct=config.correct)
-        self._predictor = Predictor(self._dynamics, self._ids, self._held, rules)
+        self._predictor = Predictor(self._dynamics, self._ids, self._held, rules, self._twin.calibration)
         self._inbox = queue.SimpleQueue()
         self._stopping = False
         self._worker = self._pool.submit(self._work)

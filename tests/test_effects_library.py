@@ -121,6 +121,9 @@ STRONG: dict[str, dict[str, float | tuple[float, ...]]] = {
     "stretch_scale": {"change": 1.5},
     "length_drift": {"rate": 0.2},
     "length_scale": {"change": -0.1},
+    "delay": {"delay": 0.25},
+    "camera_scale": {"scale": 0.2, "center": (0.9, 0.0, 0.8)},
+    "camera_rotation": {"rotation": (0.2, -0.2, 0.2), "center": (0.9, 0.0, 0.8)},
 }
 
 

@@ -14,7 +14,15 @@ from pred_core.cli.checks import warn_of_another_object
 from pred_core.errors import ConfigError
 from pred_core.evaluate.cache import PredictionCache
 from pred_core.evaluate.evaluation import EpisodeStore, Result, run_all
-from pred_core.evaluate.models import BASELINES, Model, NamedTwin, baseline_models, check_fits, twin_models
+from pred_core.evaluate.models import (
+    BASELINES,
+    Model,
+    NamedTwin,
+    baseline_models,
+    check_fits,
+    shared_calibration,
+    twin_models,
+)
 from pred_core.evaluate.quality import data_quality
 from pred_core.evaluate.report import metrics_json, write_json, write_report
 from pred_core.evaluate.splits import Split, grouped, published
@@ -47,8 +55,8 @@ def run(args: argparse.Namespace) -> int:
     splits: list[Split] = [published(dataset, args.split)]
     if args.folds:
         splits.append(grouped(dataset, args.folds))
-    store = EpisodeStore(dataset)
     twins = _twins(args.twin, args.fold_twins)
+    store = EpisodeStore(dataset, shared_calibration(twins))
     first = store.read(splits[0].folds[0].test[:1])[0]
     for named in twins:
         warn_of_another_object(named.twin, dataset, named.name or str(args.twin[0]))

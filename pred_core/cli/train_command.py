@@ -93,7 +93,7 @@ def build_trainer(
 ) -> Trainer:
     """The trainer on the train split, the twin's simulator as its base."""
     episodes: list[Episode] = list(dataset.episodes("train"))
-    recordings = [align(episode, twin.body, twin.meta.period) for episode in episodes]
+    recordings = [align(episode, twin.body, twin.meta.period, twin.calibration) for episode in episodes]
     base = load_base(twin, device)
     kept, left_out = leave_out(base, recordings, training.outlier)
     for out in left_out:

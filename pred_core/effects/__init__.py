@@ -12,6 +12,9 @@ from pred_core.effects.bending_profile import BendingProfile
 from pred_core.effects.bending_region import BendingRegion
 from pred_core.effects.bending_scale import BendingScale
 from pred_core.effects.bending_stiffening import BendingStiffening
+from pred_core.effects.camera_rotation import CameraRotation
+from pred_core.effects.camera_scale import CameraScale
+from pred_core.effects.delay import Delay
 from pred_core.effects.drag_linear import DragLinear
 from pred_core.effects.drag_quadratic import DragQuadratic
 from pred_core.effects.effect import Effect
@@ -78,6 +81,9 @@ _ALL: tuple[type[Effect], ...] = (
     GripperOffset,
     GripperRotation,
     GripSlip,
+    Delay,
+    CameraScale,
+    CameraRotation,
 )
 LIBRARY: dict[str, type[Effect]] = {e.id: e for e in _ALL}
 

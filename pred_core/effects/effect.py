@@ -116,6 +116,14 @@ class SlideContext:
     memory: tuple[Any, ...]  # `grip_memory` values of the last substep; 0 when the gripper closes
 
 
+@dataclass(frozen=True)
+class ObserveContext:
+    """What an `observe` hook may read of one particle."""
+
+    position: Vec3  # [m] world, where it truly is
+    velocity: Vec3  # [m/s] world
+
+
 class Effect:
     """Base class. A subclass declares the class attributes and overrides the hooks it names in `hooks`."""
 
@@ -190,6 +198,11 @@ class Effect:
     def inertia(cls, p: Mapping[str, Any], arc: Any) -> Any:
         """Relative mass added, (1 + this) * mass, at material coordinate `arc`."""
         raise AttributeError(f"{cls.id} has no inertia hook")
+
+    @classmethod
+    def observe(cls, p: Mapping[str, Any], at: ObserveContext) -> Vec3:
+        """Displacement of a reported point from the true one [m] world. Corrected where data enter, never simulated."""
+        raise AttributeError(f"{cls.id} has no observe hook")
 
     @classmethod
     def null(cls) -> dict[str, tuple[float, ...]]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pred_core.bag.dataset import Dataset, EpisodeEntry
+from pred_core.calibration import Calibration
 from pred_core.errors import PredError
 from pred_core.evaluate.cache import PredictionCache
 from pred_core.evaluate.models import Model, check_unseen
@@ -47,17 +48,18 @@ class NotComputed:
 
 
 class EpisodeStore:
-    """Episodes of a data set, each read once."""
+    """Episodes of a data set, each read once and corrected by one calibration: every model meets the same data."""
 
-    def __init__(self, dataset: Dataset):
+    def __init__(self, dataset: Dataset, calibration: Calibration | None = None):
         self.dataset = dataset
+        self.calibration = calibration or Calibration()
         self._read: dict[str, Episode] = {}
 
     def read(self, entries: Sequence[EpisodeEntry]) -> list[Episode]:
         """The episodes of `entries`. Raises: BagError."""
         for entry in entries:
             if entry.bag not in self._read:
-                self._read[entry.bag] = self.dataset.read(entry)
+                self._read[entry.bag] = self.calibration.correct(self.dataset.read(entry))
         return [self._read[e.bag] for e in entries]
 
 
@@ -70,7 +72,7 @@ def run_model(model: Model, split: Split, store: EpisodeStore, cache: Prediction
         number = index if split.grouped else None
         test = store.read(fold.test)
         check_episodes(test)
-        key = cache.key(model.digest, fold.digest, number)
+        key = cache.key(model.digest, f"{fold.digest}{_corrected(store.calibration)}", number)
         found = cache.load(key, [(len(e.stamps) - FIRST_PREDICTED, len(e.tracks.id), 3) for e in test])
         if found is None:
             dynamics = model.build(test, store.read(fold.train), number)
@@ -86,6 +88,10 @@ def run_model(model: Model, split: Split, store: EpisodeStore, cache: Prediction
         predictions += found
     scores = tuple(score_episode(p, e) for p, e in zip(predictions, episodes, strict=True))
     return Result(model, split, tuple(episodes), tuple(predictions), scores, trained_on, same_recording)
+
+
+def _corrected(calibration: Calibration) -> str:
+    return "" if calibration.identity else f" {calibration}"
 
 
 def run_all(

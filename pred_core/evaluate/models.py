@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pred_core.baselines import BlendedEnds, ConstantVelocity, LastResidual, Persistence, fit_static_regression
+from pred_core.calibration import Calibration
 from pred_core.dynamics import Dynamics
 from pred_core.errors import ConfigError, DatasetError, TwinError, nearest
 from pred_core.evaluate.splits import HashedFold
@@ -84,6 +85,25 @@ def check_fits(twin: Twin, episode: Episode, name: str) -> None:
         allowed=f"{len(episode.tracks.id)} particles, ids {_short(episode.tracks.id)}",
         next_step="Identify a twin on this data set: pred identify DATASET --out TWIN",
     )
+
+
+def shared_calibration(twins: Sequence[NamedTwin]) -> Calibration:
+    """What the data are corrected by, for every model alike: the calibration of the twins that have one.
+
+    Raises: TwinError if two have different ones.
+    """
+    found = Calibration()
+    for named in twins:
+        for twin in (named.twin, *named.folds):
+            if twin.calibration.identity or twin.calibration == found:
+                continue
+            if not found.identity:
+                raise TwinError(
+                    "twins have different calibrations", got=f"'{named.name}' differs from one before it",
+                    next_step="Evaluate them one by one",
+                )
+            found = twin.calibration
+    return found
 
 
 def check_unseen(model: Model, folds: Sequence[HashedFold]) -> None:

@@ -16,6 +16,7 @@ from pred_core.bag.dataset import Dataset
 from pred_core.identify.config import IdentifyConfig
 from pred_core.identify.evidence import Values, gather_evidence
 from pred_core.identify.journal import Journal
+from pred_core.identify.levers import mean_levers
 from pred_core.identify.prepare import prepare
 from pred_core.identify.refine import OUTLIER
 from pred_core.identify.search import trimmed
@@ -98,6 +99,7 @@ def identify(
         period=stages.period,
         substeps=substeps,
         held=tuple((dataset.held or {}).items()),
+        levers=mean_levers(recordings, [int(k) for k in stages.layout.body.id]),
         created_by=command,
         data=hashes,
         notes=tuple(notes),

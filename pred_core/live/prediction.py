@@ -6,8 +6,10 @@ for each period of measured gripper poses: exactly what the offline evaluation d
 
 from __future__ import annotations
 
+import dataclasses
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 
 import numpy as np
 import torch
@@ -18,8 +20,10 @@ from pred_core.bag.clouds import PointFrame
 from pred_core.bag.episode import GRASP_RADIUS
 from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
+from pred_core.calibration import Calibration
 from pred_core.dynamics import Dynamics
 from pred_core.errors import DivergenceError, InputError, TwinError
+from pred_core.live.delay import DelayedPoses
 from pred_core.live.laps import Laps, Time
 from pred_core.live.prediction_records import Counts, Pose, Prediction, Rules, grip_of
 from pred_core.types import Grip, State
@@ -29,13 +33,26 @@ MAX_WAITING = 4_000  # tracker frames kept while poses are awaited, and poses wh
 
 
 class Predictor:
-    """Feed `add_points` and `add_pose` in order of arrival; `advance` gives what can be predicted now."""
+    """Feed `add_points` and `add_pose` in order of arrival; `advance` gives what can be predicted now.
 
-    def __init__(self, dynamics: Dynamics, ids: NDArray[np.uint32], held: Mapping[int, int] | None, rules: Rules):
+    What comes in is corrected by `calibration`; predictions are true places, at the stamps of the tracker (what they
+    show is its delay older).
+    """
+
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        ids: NDArray[np.uint32],
+        held: Mapping[int, int] | None,
+        rules: Rules,
+        calibration: Calibration | None = None,
+    ):
         self._dynamics = dynamics
         self._ids = np.asarray(ids, np.uint32)
         self._held = held
         self._rules = rules
+        self._calibration = calibration or Calibration()
+        self._delayed = DelayedPoses(self._calibration.delay, rules.max_gap) if self._calibration.delay else None
         self._period = round(dynamics.period * 1e9)  # [ns]
         self._frames: deque[tuple[Time, PointFrame]] = deque()
         self._poses: deque[Pose] = deque()
@@ -66,6 +83,8 @@ class Predictor:
         self._frames.clear()
         self._poses.clear()
         self._laps.clear()
+        if self._delayed is not None:
+            self._delayed.clear()
         self._pose_lap, self._time, self._begin = 0, (-1, 0), (-1, 0)
 
     def cancel(self) -> None:
@@ -85,6 +104,7 @@ class Predictor:
                 allowed=f"{len(self._ids)} ids, {self._ids.min()} to {self._ids.max()}",
                 next_step="Give the twin that was identified on this object's tracks",
             )
+        frame = dataclasses.replace(frame, position=self._calibration.correct_points(frame.position))
         self._take(TRACKER_POINTS, frame.stamp, lambda time: self._keep_frame(time, frame))
 
     def add_pose(self, pose: PoseFrame, closed: NDArray[np.bool_]) -> None:
@@ -100,7 +120,10 @@ class Predictor:
         needed = max(self._held.values(), default=-1) + 1 if self._held else 0
         if count < needed:
             raise InputError(f"{GRIPPER_POSE}: too few grippers for 'held'", got=count, allowed=f"{needed} or more")
-        self._take(GRIPPER_POSE, pose.stamp, lambda time: self._keep_pose(Pose(pose, closed, time[0])))
+        position, rotation = self._calibration.correct_pose(pose.position, pose.rotation)
+        pose = PoseFrame(pose.stamp, position, rotation)
+        for p, c in [(pose, closed)] if self._delayed is None else self._delayed.take(pose, closed):
+            self._take(GRIPPER_POSE, p.stamp, partial(self._keep_posed, p, c))
 
     def advance(self) -> Iterable[Prediction]:
         """Predictions that the data so far allow, oldest first.
@@ -129,6 +152,9 @@ class Predictor:
     def _take(self, topic: str, stamp: int, keep: Callable[[Time], None]) -> None:
         for time, action in self._laps.take(topic, stamp, keep):
             action(time)
+
+    def _keep_posed(self, pose: PoseFrame, closed: NDArray[np.bool_], time: Time) -> None:
+        self._keep_pose(Pose(pose, closed, time[0]))
 
     def _keep_frame(self, time: Time, frame: PointFrame) -> None:
         while self._frames and self._frames[-1][0] >= time:  # their stamps were out of line

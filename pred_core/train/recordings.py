@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pred_core.calibration import Calibration
 from pred_core.errors import DatasetError
 from pred_core.types import Body, Episode, Grip, State
 
@@ -38,8 +39,8 @@ class Batch:
     seen: Tensor  # (K, B, N) bool
 
 
-def align(episode: Episode, body: Body, period: float) -> Recording:
-    """The episode in the body's order of particles.
+def align(episode: Episode, body: Body, period: float, calibration: Calibration | None = None) -> Recording:
+    """The episode in the body's order of particles, corrected by the calibration of the twin it is for.
 
     Raises: DatasetError if a particle of the body is not in the tracks, or the rates differ.
     """
@@ -50,6 +51,8 @@ def align(episode: Episode, body: Body, period: float) -> Recording:
             allowed=f"{period:.6g} s within {PERIOD_TOLERANCE:.0%}",
             next_step="Identify a twin at this rate",
         )
+    if calibration is not None:
+        episode = calibration.correct(episode)
     column = {int(k): i for i, k in enumerate(episode.tracks.id)}
     missing = [int(k) for k in body.id if int(k) not in column]
     if missing:
