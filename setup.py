@@ -9,7 +9,7 @@ SHARE = f"share/{PACKAGE}"
 ROOT = Path(__file__).parent
 
 # `ros2 run pred_ros NAME` and the script `NAME` of a pip install.
-NODES = ("player", "predictor", "evaluator", "arm")
+NODES = ("player", "tracker", "predictor", "evaluator", "planner", "arm")
 
 CORE = [
     "cma",

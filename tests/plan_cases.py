@@ -73,7 +73,7 @@ def seen(stamp: int = 0, at: np.ndarray | None = None, offset: tuple[float, floa
 def settings(**search: float) -> PlannerConfig:
     """Fast settings in a wide box: 1 s, 6 segments."""
     motion = MotionConfig(horizon=1.2, knots=6, speed=0.5, acceleration=4.0, turn_speed=1.5, **BOX)
-    values = {"samples": 32, "iterations": 6, "chunk": 16, "noise": 0.25, "turn_noise": 0.8, "frames": 4, **search}
+    values = {"samples": 32, "iterations": 6, "chunk": 16, "noise": 0.25, "turn_noise": 2.0, "frames": 4, **search}
     return PlannerConfig(motion=motion, search=SearchConfig(**values))  # type: ignore[arg-type]
 
 

@@ -35,7 +35,7 @@ class SearchConfig:
     iterations: int = setting(8, low=1, high=10_000, doc="most iterations a plan; a deadline may end it earlier")
     temperature: float = setting(0.1, unit="", low=1e-3, high=100.0, doc="in units of median less least cost")
     noise: float = setting(0.12, unit="m/s", low=0.0, high=5.0, doc="standard deviation of a knot's velocity")
-    turn_noise: float = setting(0.5, unit="rad/s", low=0.0, high=10.0, doc="standard deviation of a knot's yaw rate")
+    turn_noise: float = setting(1.0, unit="rad/s", low=0.0, high=10.0, doc="standard deviation of a knot's yaw rate")
     correlation: float = setting(0.7, unit="", low=0.0, high=0.99, doc="of the noise of neighbouring knots")
     finest: float = setting(0.25, unit="", low=0.01, high=1.0, doc="noise of the last sample over that of the first")
     shrink: float = setting(0.85, unit="", low=0.1, high=1.0, doc="noise of an iteration over that of the one before")

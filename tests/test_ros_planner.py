@@ -1,0 +1,283 @@
+"""The planner node over real topics: a loop that reaches its goal, services, and how it answers bad input."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not installed")
+
+import torch
+from live_world import COUNT, make_twin
+from plan_cases import DOWN, Rigid
+from ros_bench import Bench, bench_of
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import MultiDOFJointTrajectory
+from visualization_msgs.msg import MarkerArray
+
+from pred_core.arm.limits import GuardConfig
+from pred_core.bag.grippers import PoseFrame
+from pred_core.bag.wire import stamp_of
+from pred_core.types import State
+from pred_ros import arm_messages, convert, planner_messages, qos
+from pred_ros.diagnostics import ERROR, OK, WARN
+from pred_ros.planner_node import PlannerNode
+from pred_ros.processes import free_domain, node_command, node_environment
+
+HOME = np.array([0.45, 0.0, 0.25])
+MOVE = np.array([0.06, 0.08, 0.05])  # [m]
+IDS = np.arange(COUNT, dtype=np.uint32)
+LINE = np.column_stack((0.05 * np.arange(COUNT), np.zeros((COUNT, 2))))
+SETTINGS = """
+motion: {horizon: 1.0, knots: 5, speed: 0.2}
+search: {samples: 32, chunk: 16, iterations: 4, frames: 4}
+"""
+
+
+class RigidPlanner(PlannerNode):
+    """The node with an object that moves rigidly with its gripper."""
+
+    MAKE_DYNAMICS = staticmethod(lambda twin, scene, device: Rigid(period=0.05))
+
+
+class World:
+    """An arm that follows the newest plan exactly, and what is seen of a rigid line it holds."""
+
+    def __init__(self, bench: Bench):
+        self.bench = bench
+        self.plans: list[MultiDOFJointTrajectory] = []
+        self.following = True
+        world = bench.world
+        world.create_subscription(MultiDOFJointTrajectory, "plan/trajectory", self.plans.append, qos.command())
+        self.state_out = world.create_publisher(PointCloud2, "state/points", qos.points_complete())
+        self.goal_out = world.create_publisher(PointCloud2, "goal/points", qos.latched())
+        self.moved = np.zeros(3)
+        bench.until(lambda: self.state_out.get_subscription_count() >= 1, "the node listens")
+
+    def now(self) -> int:
+        return int(self.bench.world.get_clock().now().nanoseconds)
+
+    def place(self, stamp: int) -> np.ndarray:
+        """Where the gripper is: along the newest plan that has begun."""
+        if self.following:
+            for message in self.plans:
+                plan = arm_messages.message_to_plan(message, GuardConfig())
+                if plan.begin <= stamp:
+                    self.moved = plan.at(stamp)[0] - HOME
+        return HOME + self.moved
+
+    def see(self, stamp: int | None = None, position: np.ndarray | None = None, pose: bool = True) -> None:
+        """Publish the pose and the state of one instant."""
+        stamp = self.now() if stamp is None else stamp
+        here = self.place(stamp)
+        if pose:
+            self.bench.pose_out.publish(convert.pose_to_message(PoseFrame(stamp, here[None], DOWN)))
+        points = torch.tensor(here + LINE if position is None else position, dtype=torch.float32)
+        held = torch.full((len(points),), -1, dtype=torch.int32)
+        held[0] = 0
+        cloud = convert.make_cloud if position is not None and not np.isfinite(position).all() else None
+        if cloud is not None:
+            columns = dict(zip(("x", "y", "z"), points.numpy().T, strict=True))
+            zeros = {k: np.zeros(len(points)) for k in ("vx", "vy", "vz")}
+            layout = {**dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), "f4"), "id": "u4", "held": "i4"}
+            message = cloud(stamp, layout, {**columns, **zeros, "id": IDS, "held": held.numpy()})
+        else:
+            ids = np.arange(len(points), dtype=np.uint32)
+            message = convert.state_to_cloud(stamp, ids, State(points, torch.zeros_like(points), held))
+        self.state_out.publish(message)
+
+    def live(self, condition: Any, what: str, limit: float = 20.0) -> None:
+        """Publish at about 30 Hz until the condition holds."""
+        due = [0.0]
+
+        def tick() -> bool:
+            if time.monotonic() >= due[0]:
+                due[0] = time.monotonic() + 0.033
+                self.see()
+            return bool(condition())
+
+        self.bench.until(tick, what, limit)
+
+    def goal(self, points: np.ndarray) -> None:
+        self.goal_out.publish(planner_messages.goal_to_cloud(self.now(), points))
+
+    def ask(self, service: str, kind: type, request: Any) -> Any:
+        client = self.bench.world.create_client(kind, f"/planner/{service}")
+        self.bench.until(client.service_is_ready, "the service")
+        answer = client.call_async(request)
+        self.bench.until(answer.done, "an answer")
+        return answer.result()
+
+    def enable(self, on: bool = True) -> Any:
+        return self.ask("enable", SetBool, SetBool.Request(data=on))
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    folder = tmp_path_factory.mktemp("planner")
+    (folder / "settings.yaml").write_text(SETTINGS)
+    return {"twin": str(make_twin(folder / "twin")), "settings": str(folder / "settings.yaml")}
+
+
+@contextmanager
+def world_of(files: dict[str, str], **parameters: str) -> Iterator[World]:
+    values = {**files, "budget": "0.2", **parameters}
+    with bench_of(RigidPlanner, values, feeds=False) as bench:
+        yield World(bench)
+
+
+def test_loop_reaches_the_goal_with_plans_the_arm_accepts(files: dict[str, str]) -> None:
+    with world_of(files, reached="0.006") as world:
+        world.goal(HOME + LINE + MOVE)
+        world.see()
+        assert world.enable().success
+        world.live(lambda: world.bench.says(OK, "goal reached"), "the goal is reached", limit=30.0)
+        plans = [arm_messages.message_to_plan(m, GuardConfig()) for m in world.plans]  # raises for one with a jump
+        assert len(plans) >= 2 and all(p.ends_at_rest for p in plans)
+        for before, after in zip(plans[:-1], plans[1:], strict=True):
+            # A point every 20 ms at 0.2 m/s, straight in between: off the curve by a dt^2 / 8 < 0.1 mm.
+            assert np.linalg.norm(before.at(after.begin)[0] - after.at(after.begin)[0]) < 5e-4
+        assert np.linalg.norm(world.moved - MOVE) < 0.012
+        assert all(m.header.frame_id == "world" and list(m.joint_names) == ["gripper0"] for m in world.plans)
+
+
+def test_nothing_is_sent_before_enable_and_stop_latches(files: dict[str, str]) -> None:
+    with world_of(files) as world:
+        world.goal(HOME + LINE + MOVE)
+        world.live(lambda: world.bench.says(OK, "call ~/enable"), "the node is ready")
+        assert not world.plans
+        world.enable()
+        world.live(lambda: len(world.plans) >= 2, "plans")
+        assert world.ask("stop", Trigger, Trigger.Request()).success
+        count = len(world.plans)
+        world.bench.until(lambda: len(world.plans) > count, "a plan that comes to rest")
+        last = arm_messages.message_to_plan(world.plans[-1], GuardConfig())
+        # Within two knots of 0.2 s, plus the point that repeats the last pose.
+        assert last.ends_at_rest and last.times[-1] <= 0.4 + 0.03
+        world.live(lambda: world.bench.says(WARN, "stopped; call ~/reset"), "it says so")
+        assert not world.enable().success
+        count = len(world.plans)
+        assert world.ask("reset", Trigger, Trigger.Request()).success and world.enable().success
+        world.live(lambda: len(world.plans) > count, "plans again")
+
+
+def test_a_plan_begins_after_it_is_sent(files: dict[str, str]) -> None:
+    with world_of(files) as world:
+        ages: list[float] = []
+        world.bench.world.create_subscription(
+            MultiDOFJointTrajectory, "plan/trajectory", lambda m: ages.append((stamp_of(m) - world.now()) / 1e9),
+            qos.command(),
+        )  # fmt: skip
+        world.goal(HOME + LINE + MOVE)
+        world.see()
+        world.enable()
+        world.live(lambda: len(ages) >= 4, "plans")
+        # Budget 0.2 s and margin 0.05 s from the start of planning; the search keeps its budget to a chunk.
+        assert min(ages) > 0.0 and max(ages) <= 0.25 + 0.05
+
+
+def test_an_arm_that_does_not_follow_is_planned_from_where_it_is(files: dict[str, str]) -> None:
+    with world_of(files, off_track="0.01") as world:
+        world.following = False
+        world.goal(HOME + LINE + MOVE)
+        world.see()
+        world.enable()
+        world.live(lambda: world.bench.node._session.counts.off_track >= 1, "the plan is given up")
+        count = len(world.plans)
+        world.live(lambda: len(world.plans) > count, "another plan")
+        plan = arm_messages.message_to_plan(world.plans[count], GuardConfig())
+        assert plan.position[0] == pytest.approx(HOME, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("goal", "words"),
+    [
+        (np.zeros((0, 3)), ("goal is empty",)),
+        (HOME + LINE + [2.0, 0.0, 0.0], ("out of reach",)),
+        (np.full((3, 3), np.nan), ("goal", "not finite")),
+    ],
+)
+def test_an_unusable_goal_is_refused_and_a_good_one_helps(
+    files: dict[str, str], goal: np.ndarray, words: tuple[str, ...]
+) -> None:
+    with world_of(files, enabled="true") as world:
+        world.goal(goal)
+        world.live(lambda: world.bench.says(ERROR, *words), "an error that says why")
+        assert not world.plans and world.bench.node.exit_code is None
+        world.goal(HOME + LINE + MOVE)
+        world.live(lambda: world.plans, "a plan to the good goal")
+
+
+def test_bad_states_are_refused_with_the_reason(files: dict[str, str]) -> None:
+    with world_of(files, enabled="true") as world:
+        world.goal(HOME + LINE + MOVE)
+        broken = HOME + LINE
+        broken[2] = math.nan
+        world.see()
+        world.see(position=broken)
+        world.bench.until(lambda: world.bench.says(ERROR, "ids [2] are not finite"), "NaN is named")
+        world.see(stamp=world.now() - 2_000_000_000)
+        world.bench.until(lambda: world.bench.says(ERROR, "state is too old"), "age is named")
+        world.see(stamp=world.now() + 300_000_000, pose=False)
+        world.bench.until(lambda: world.bench.says(ERROR, "no gripper/pose at the stamp"), "the missing pose is named")
+        cloud = planner_messages.goal_to_cloud(world.now(), LINE)
+        cloud.header.frame_id = "camera"
+        world.goal_out.publish(cloud)
+        world.bench.until(lambda: world.bench.says(ERROR, "goal/points", "camera"), "the frame is named")
+        assert world.bench.node.exit_code is None
+
+
+def test_silence_is_said(files: dict[str, str]) -> None:
+    with world_of(files, enabled="true") as world:
+        world.goal(HOME + LINE + MOVE)
+        world.live(lambda: world.plans, "a plan")
+        world.bench.until(lambda: world.bench.says(ERROR, "state/points stopped"), "silence is an error")
+
+
+def test_a_state_of_another_twin_ends_the_node(files: dict[str, str], capsys: pytest.CaptureFixture) -> None:
+    with world_of(files, enabled="true") as world:
+        world.goal(HOME + LINE + MOVE)
+        world.see(position=np.concatenate((HOME + LINE, HOME + LINE + 0.1)))
+        world.bench.until(lambda: world.bench.node.exit_code == 2, "the node gives up")
+        assert "do not match the twin" in capsys.readouterr().err
+
+
+def test_markers_only_when_asked_for(files: dict[str, str]) -> None:
+    with world_of(files, enabled="true", markers="true") as world:
+        seen: list[MarkerArray] = []
+        world.bench.world.create_subscription(MarkerArray, "/planner/markers", seen.append, qos.latched())
+        world.goal(HOME + LINE + MOVE)
+        world.live(lambda: seen, "markers")
+        spaces = [m.ns for m in seen[-1].markers]
+        assert spaces.count("plan") == 1 and spaces.count("samples") > 16
+    with world_of(files) as world:
+        assert world.bench.world.count_publishers("/planner/markers") == 0
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({}, "parameter 'twin' is empty"),
+        ({"twin": "/nowhere"}, "not a twin"),
+        ({"budgets": 0.1}, "did you mean 'budget'?"),
+    ],
+)
+def test_a_process_with_bad_parameters_ends_with_one_line(
+    tmp_path: Path, parameters: dict[str, Any], words: str
+) -> None:
+    done = subprocess.run(
+        node_command("planner", parameters), env=node_environment(free_domain()), capture_output=True, text=True,
+        timeout=30, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    lines = [line for line in done.stderr.strip().splitlines() if line.startswith("planner:")]
+    assert len(lines) == 1 and words in lines[0]
