@@ -12,6 +12,8 @@ from pred_core.bag.dataset import Dataset
 from pred_core.bag.measured import find_measured
 from pred_core.bag.unseen import complete_line, spline_matrix
 from pred_core.cli.main import main
+from pred_core.effects.bending_scale import BendingScale
+from pred_core.effects.tip_mass import TipMass
 from pred_core.errors import DatasetError
 from pred_core.evaluate.protocol import predict
 from pred_core.springmass import SpringMass
@@ -167,3 +169,34 @@ def test_the_load_slows_the_beam_up_and_down_but_not_sideways(tmp_path: Path) ->
             spectrum = np.abs(np.fft.rfft((tip[:, 0] - tip[:, 0].mean()) * np.hanning(len(tip)), 4096))
             slow, fast = ((frequency > low) & (frequency < high) for low, high in ((4.0, 4.8), (6.0, 9.0)))
             assert spectrum[slow].max() < 0.4 * spectrum[fast].max()
+
+
+@measured
+def test_added_mass_at_the_tip_and_a_softer_beam_part_where_sag_and_frequency_meet(tmp_path: Path) -> None:
+    # Mass or stiffness changed everywhere: sag ~ m/k and f^2 ~ k/m, their product stays. Mass added at the tip moves
+    # more in the mode than it sags: a uniform cantilever has sag (2 pi f)^2 = 12.4/8 g, a massless one with all its
+    # mass at the end 1 g. So with the sag of the loaded beam the tip mass swings slower than the softer beam.
+    path = find_measured("soft_beam")
+    assert path is not None
+    twin, real = Twin.load(TWIN), {}
+    for load in (0, 52):
+        episode = next(_convert(path, tmp_path / str(load), load).episodes("train"))
+        real[load] = _ring(episode.position[2:, -1, 2] - episode.position[0, 0, 2])
+    assert _product(real[0]) == pytest.approx(12.4 / 8, rel=0.05)
+    assert 1.15 < _product(real[52]) < 1.35
+    changed = {}
+    for effect in (TipMass.extension(change=8.2), BendingScale.extension(change=-0.629)):
+        simulator = SpringMass(
+            twin.body, twin.physics, twin.scene, period=twin.meta.period, extensions=(*twin.extensions, effect)
+        )
+        simulated = predict(simulator, [episode])[0][:, -1, 2] - episode.position[0, 0, 2]
+        changed[effect.id] = _ring(simulated)
+        assert changed[effect.id][1] == pytest.approx(real[52][1], rel=0.02)
+    assert _product(changed["bending_scale"]) == pytest.approx(_product(real[0]), rel=0.06)
+    slow, fast = changed["tip_mass"][0], changed["bending_scale"][0]
+    assert slow < real[52][0] < fast and real[52][0] - slow < 0.7 * (fast - real[52][0])
+
+
+def _product(ring: tuple[float, float]) -> float:
+    """Sag times squared angular frequency over gravity."""
+    return -ring[1] * (2 * np.pi * ring[0]) ** 2 / 9.81
