@@ -26,7 +26,7 @@ from pred_core.twin import Extension
 from pred_core.types import Grip, Physics, Scene, State
 
 PHYSICS = Physics(stiffness=60.0, damping=0.3, ground_friction=0.4, bending_stiffness=1e-3)
-ALL = {
+ALL: dict[str, dict[str, Any]] = {
     "bending_creep": {"rate": 2.0},
     "bending_plasticity": {"radius": 0.3},
     "rest_bow": {"curvature": (2.0, -1.0)},
@@ -163,7 +163,7 @@ def test_a_line_keeps_what_it_was_bent_to_beyond_elastic(id: str, far: float) ->
     ends = torch.tensor([[0.0, 0.0, 0.0], [0.55, 0.0, 0.0]])
     grips = Grip(ends.expand(240 + 60, 2, 3), turned, torch.ones(300, 2, dtype=torch.bool))
     left = {}
-    values: dict[str, Any] = {"bending_creep": {"rate": far}, "bending_plasticity": {"radius": far}}[id]
+    values = {"bending_creep": {"rate": far}, "bending_plasticity": {"radius": far}}[id]
     for name, strength in (("with", values), ("without", {})):
         causes = [LIBRARY[id].extension(**strength), LIBRARY["drag_linear"].extension(coefficient=8.0)]
         sim = SpringMass(body, dataclasses.replace(PHYSICS, damping=1.0), NOWHERE, extensions=causes)
@@ -252,5 +252,7 @@ def test_planted_value_is_found(id: str) -> None:
 
 
 def _repeated(state: State, first: Grip, worlds: int) -> tuple[State, Grip]:
-    many = State(*(v.expand(worlds, *v.shape[1:]).contiguous() for v in (state.position, state.velocity, state.held)))
-    return many, Grip(*(v.expand(worlds, *v.shape[1:]) for v in vars(first).values()))
+    position, velocity, held = (
+        v.expand(worlds, *v.shape[1:]).contiguous() for v in (state.position, state.velocity, state.held)
+    )
+    return State(position, velocity, held), Grip(*(v.expand(worlds, *v.shape[1:]) for v in vars(first).values()))
