@@ -47,11 +47,12 @@ class View:
         frame = self.picture
         pixel, depth = project(points, frame.intrinsics, frame.world_from_camera)
         height, width = frame.depth.shape
-        inside = np.isfinite(pixel).all(axis=-1)
+        inside: NDArray[np.bool_] = np.asarray(np.isfinite(pixel).all(axis=-1))
         at = np.round(np.where(inside[:, None], pixel, -1.0)).astype(int)
         inside &= (at >= 0).all(axis=-1) & (at[:, 0] < width) & (at[:, 1] < height)
         found = np.zeros(len(points), bool)
-        found[inside] = frame.depth[at[inside, 1], at[inside, 0]] > depth[inside] - margin  # NaN is no evidence
+        seen = at[inside]
+        found[inside] = frame.depth[seen[:, 1], seen[:, 0]] > depth[inside] - margin  # NaN is no evidence
         return found
 
 

@@ -1,0 +1,294 @@
+"""The tracker: pictures of up to eight RGB-D cameras in, persistent particles out.
+
+In: camN/color/image_raw, camN/depth/image_raw, camN/color/camera_info, camN/pose, gripper/pose, gripper/closed, and
+with `prior` state/points. Out: tracker/points with the stamp of the newest picture. `~/reset` (Trigger) searches anew.
+"""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, ClassVar, NoReturn
+
+import numpy as np
+from geometry_msgs.msg import PoseArray, PoseStamped
+from numpy.typing import NDArray
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_msgs.msg import UInt8MultiArray
+from std_srvs.srv import Trigger
+
+from pred_core.bag import images
+from pred_core.bag.clouds import PointFrame
+from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, STATE_POINTS, TRACKER_POINTS
+from pred_core.config import setting
+from pred_core.errors import ConfigError, PredError
+from pred_core.track.estimate import Estimate, Prior
+from pred_core.track.line_tracker import LineConfig
+from pred_core.track.tracker import MOST_CAMERAS, Tracker, TrackerConfig
+from pred_core.track.workspace import Workspace
+from pred_core.types import Box
+from pred_ros import convert, qos, shell
+from pred_ros.camera_pairs import CameraPairs
+from pred_ros.diagnostics import ERROR, OK, WARN
+from pred_ros.shell import Shell
+
+REFUSED_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
+SILENT = 1.0  # [s] without a picture before a camera counts as dead
+
+
+@dataclass(frozen=True)
+class TrackerNodeConfig:
+    """Parameters of the tracker."""
+
+    cameras: str = setting("cam0 cam1 cam2 cam3", doc="prefixes of the cameras' topics, 1 to 8")
+    kind: str = setting("line", choices=("line", "sheet", "volume"), doc="geometry class of the object")
+    x_low: float = setting(-0.6, unit="m", low=-10.0, high=10.0, doc="workspace in world")
+    x_high: float = setting(0.6, unit="m", low=-10.0, high=10.0)
+    y_low: float = setting(-0.6, unit="m", low=-10.0, high=10.0)
+    y_high: float = setting(0.6, unit="m", low=-10.0, high=10.0)
+    z_low: float = setting(0.0, unit="m", low=-10.0, high=10.0)
+    z_high: float = setting(1.0, unit="m", low=-10.0, high=10.0)
+    table: float = setting(0.0, unit="m", low=-10.0, high=10.0, doc="height of the table's top")
+    fixtures: str = setting("", doc="boxes to ignore: 'x y z hx hy hz; ...' centre and half size [m]")
+    length: float = setting(0.0, unit="m", low=0.0, high=20.0, doc="of a line; 0: measured when it is found")
+    radius: float = setting(0.0, unit="m", low=0.0, high=0.1, doc="of a line; 0: measured when it is found")
+    particles: int = setting(61, low=4, high=5000, doc="of the object")
+    arm_radius: float = setting(0.0, unit="m", low=0.0, high=0.3, doc="of the arm above each gripper; 0: none in view")
+    arm_start: float = setting(0.05, unit="m", low=-0.5, high=0.5, doc="of it, along the gripper's +z")
+    arm_end: float = setting(0.4, unit="m", low=-0.5, high=2.0, doc="of it, along the gripper's +z")
+    prior: bool = setting(False, doc="use state/points of the predictor as motion prior")
+    prior_sigma: float = setting(0.01, unit="m", low=1e-3, high=0.5, doc="standard deviation of the prior")
+    patience: float = setting(0.03, unit="s", low=0.0, high=1.0, doc="wait for the other cameras after the first")
+    autostart: bool = setting(True, doc="configure and activate without a lifecycle manager")
+
+
+def core_config(config: TrackerNodeConfig) -> TrackerConfig:
+    """The core's configuration."""
+    low, high = (config.x_low, config.y_low, config.z_low), (config.x_high, config.y_high, config.z_high)
+    return TrackerConfig(
+        kind=config.kind,
+        arm_radius=config.arm_radius,
+        arm_start=config.arm_start,
+        arm_end=config.arm_end,
+        workspace=Workspace(low, high, config.table),
+        line=LineConfig(length=config.length, radius=config.radius, particles=config.particles),
+    )
+
+
+def parse_cameras(text: str) -> list[str]:
+    """'cam0, cam1' -> ['cam0', 'cam1']. Raises: ConfigError for none, too many or a repeated one."""
+    names = text.replace(",", " ").split()
+    if not 1 <= len(set(names)) == len(names) <= MOST_CAMERAS:
+        raise ConfigError(
+            "parameter 'cameras'",
+            got=repr(text),
+            allowed=f"1 to {MOST_CAMERAS} different prefixes",
+            next_step="-p cameras:='cam0 cam1'",
+        )
+    return names
+
+
+def parse_fixtures(text: str) -> tuple[Box, ...]:
+    """'x y z hx hy hz; ...' -> boxes. Raises: ConfigError."""
+    boxes = []
+    for item in filter(str.strip, text.split(";")):
+        try:
+            x, y, z, a, b, c = (float(v) for v in item.replace(",", " ").split())
+        except ValueError as error:
+            raise ConfigError(
+                "parameter 'fixtures'", got=repr(item), allowed="six numbers a box: x y z hx hy hz"
+            ) from error
+        boxes.append(Box((x, y, z), (a, b, c)))
+    return tuple(boxes)
+
+
+class TrackerNode(Shell):
+    """Callbacks only store messages; one worker thread owns the `Tracker`."""
+
+    NAME: ClassVar[str] = "tracker"
+    CONFIG: ClassVar[type] = TrackerNodeConfig
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._worker: Future[None] | None = None
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="tracking")
+        self._inputs: list[Subscription] = []
+        self._lock = threading.Lock()  # guards what callbacks hand to the worker
+        self._news: list[Callable[[Tracker], None]] = []
+        self._closed: NDArray[np.bool_] = np.zeros(0, bool)
+        self._refused = ""
+        self._status = "searching"
+        self._stopping = False
+
+    def setup(self) -> None:
+        """Check the parameters, build the tracker."""
+        config: TrackerNodeConfig = self.config
+        self._names = parse_cameras(config.cameras)
+        self._tracker = Tracker(core_config(config), self._names)
+        self._tracker.fixtures = parse_fixtures(config.fixtures)
+        self._out = self.create_publisher(PointCloud2, TRACKER_POINTS, qos.points_complete())
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.report(WARN, f"waiting for pictures of {', '.join(self._names)}")
+
+    def start(self) -> None:
+        """Subscribe and start the worker."""
+        self._pairs = CameraPairs(self._names)
+        self._stopping = False
+        self._worker = self._pool.submit(self._work)
+        for name in self._names:
+            for kind, topic in (("color", images.COLOR), ("depth", images.DEPTH)):
+                callback = functools.partial(self._on_image, name, kind)
+                self._listen(Image, f"{name}/{topic}", callback, qos_profile_sensor_data)
+            for message_type, topic, profile, add in (
+                (CameraInfo, images.INFO, qos_profile_sensor_data, self._pairs.add_info),
+                (PoseStamped, images.POSE, qos.latched(), self._pairs.add_pose),
+            ):
+                callback = functools.partial(self._take, f"{name}/{topic}", functools.partial(add, name))
+                self._listen(message_type, f"{name}/{topic}", callback, profile)
+        self._listen(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed, qos.points_live())
+        self._listen(PoseArray, GRIPPER_POSE, self._on_pose, qos.poses_live())
+        if self.config.prior:
+            self._listen(PointCloud2, STATE_POINTS, self._on_state, qos.points_live())
+        self._watch = self.create_timer(0.05, self._check_worker)
+
+    def stop(self) -> None:
+        """End the worker."""
+        if self._worker is None:
+            return
+        self._worker = None
+        for subscription in self._inputs:
+            self.destroy_subscription(subscription)
+        self._inputs = []
+        self.destroy_timer(self._watch)
+        self._stopping = True
+        self._pairs.close()
+        self._pool.shutdown(wait=True)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="tracking")
+
+    def changed(self, config: TrackerNodeConfig) -> None:
+        """Parameters are fixed while the node is active."""
+        parse_cameras(config.cameras)
+        parse_fixtures(config.fixtures)
+        if self._worker is not None:
+            raise ConfigError(
+                "parameters of the tracker cannot change while it is active", next_step="Deactivate the node first"
+            )
+
+    def heartbeat(self) -> None:
+        """Judge ages: dead cameras, refused messages, whether the object is in view."""
+        if self._worker is None:
+            return
+        self.diagnostics.value("pictures dropped, newer came", str(self._pairs.dropped))
+        silent = self._pairs.silent(SILENT)
+        refused_age = self.diagnostics.age("refused message")
+        if refused_age is not None and refused_age < REFUSED_SHOWN:
+            self.report(ERROR, self._refused)
+        elif len(silent) == len(self._names):
+            self.report(ERROR, f"no pictures of {', '.join(silent)}: nothing is tracked")
+        elif self._status != "tracking":
+            self.report(WARN, f"{self._status}: the object is not in view, or is not a {self.config.kind}")
+        elif silent:
+            self.report(WARN, f"tracking without {', '.join(silent)}: no pictures")
+        else:
+            self.report(OK, "tracking")
+
+    def _listen(self, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any) -> None:
+        self._inputs.append(self.create_subscription(kind, topic, callback, profile))
+
+    def _check_worker(self) -> None:
+        if self._worker is not None and self._worker.done():
+            self._worker.result()  # raises the bug that ended the worker; the process ends with its trace
+
+    def _on_image(self, name: str, kind: str, message: Image) -> None:
+        self.diagnostics.seen(f"{name} {kind}")
+        self._pairs.add_image(name, kind, message)
+
+    def _on_closed(self, message: UInt8MultiArray) -> None:
+        self._take(GRIPPER_CLOSED, self._set_closed, message)
+
+    def _set_closed(self, message: UInt8MultiArray) -> None:
+        self._closed = convert.message_to_closed(message)
+
+    def _on_pose(self, message: PoseArray) -> None:
+        self._take(GRIPPER_POSE, self._add_pose, message)
+
+    def _add_pose(self, message: PoseArray) -> None:
+        pose = convert.message_to_pose(message)
+        closed = self._closed
+        self._tell(lambda tracker: tracker.add_grip(pose.stamp, pose.position, pose.rotation, closed))
+
+    def _on_state(self, message: PointCloud2) -> None:
+        self._take(STATE_POINTS, self._add_state, message)
+
+    def _add_state(self, message: PointCloud2) -> None:
+        stamp, ids, state = convert.cloud_to_state(message, STATE_POINTS)
+        position, velocity = (x.numpy().astype(np.float64) for x in (state.position, state.velocity))
+        prior = Prior(stamp, ids, position, velocity, self.config.prior_sigma)
+        self._tell(lambda tracker: tracker.set_prior(prior))
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._tell(lambda tracker: tracker.reset())
+        response.success, response.message = True, "searching in the next pictures"
+        return response
+
+    def _tell(self, action: Callable[[Tracker], None]) -> None:
+        with self._lock:
+            self._news.append(action)
+
+    def _take(self, topic: str, action: Callable[[Any], None], message: Any) -> None:
+        self.diagnostics.seen(topic)
+        self.diagnostics.count(f"messages on {topic}")
+        try:
+            action(message)
+        except PredError as error:
+            self._refuse(error)
+
+    def _refuse(self, error: PredError) -> None:
+        self._refused = f"refused: {error}"
+        self.diagnostics.seen("refused message")
+        self.diagnostics.count("refused messages")
+        self.report(ERROR, self._refused)
+
+    # Below: the worker thread. It alone touches the Tracker.
+
+    def _work(self) -> None:
+        while not self._stopping:
+            pairs = self._pairs.take(self.config.patience)
+            with self._lock:
+                news, self._news = self._news, []
+            try:
+                for action in news:
+                    action(self._tracker)
+            except PredError as error:
+                self._refuse(error)
+            for name, pair in pairs.items():
+                try:
+                    self._tracker.add_frame(name, self._pairs.picture(name, pair))
+                except PredError as error:
+                    self._refuse(error)
+            estimate = self._tracker.step()
+            self._status = "searching" if estimate is None else estimate.status
+            if estimate is not None:
+                self._publish(estimate)
+
+    def _publish(self, estimate: Estimate) -> None:
+        t = estimate.tracks
+        frame = PointFrame(int(t.stamp), t.position, t.id, t.confidence, None)
+        self._out.publish(convert.points_to_cloud(frame))
+        self.diagnostics.count("estimates")
+        self.diagnostics.value("residual [mm]", f"{1e3 * estimate.residual:.2f}")
+        self.diagnostics.value("particles in view", f"{int(t.visible.sum())} of {len(t.id)}")
+
+
+def main() -> NoReturn:
+    """Entry point of `ros2 run pred_ros tracker`."""
+    shell.main(TrackerNode)
+
+
+if __name__ == "__main__":
+    main()

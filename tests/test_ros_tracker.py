@@ -1,0 +1,197 @@
+"""The tracker node fed over real topics: what it publishes, and how it answers bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not installed")
+pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from rclpy.qos import qos_profile_sensor_data
+from ros_bench import Bench, bench_of, own_domain
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from track_scenes import LENGTH, STEP, TURN, HangingRope
+
+from pred_core.bag import images
+from pred_core.bag.clouds import PointFrame
+from pred_core.bag.grippers import PoseFrame
+from pred_core.bag.wire import TRACKER_POINTS
+from pred_core.errors import ConfigError
+from pred_core.types import CameraFrame
+from pred_ros import convert, qos
+from pred_ros.tracker_node import TrackerNode, parse_cameras, parse_fixtures
+
+ERROR, WARN, OK = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
+START = 5_000_000_000  # [ns]
+NAMES = ("cam0", "cam1")
+PARAMETERS = {"cameras": "cam0 cam1", "particles": "26", "patience": "0.2"}
+
+
+class Rig:
+    """Publishers that look like two camera drivers and an arm."""
+
+    def __init__(self, bench: Bench, scene: HangingRope):
+        self.bench, self.scene = bench, scene
+        make = bench.world.create_publisher
+        self.color = {n: make(Image, f"{n}/{images.COLOR}", qos_profile_sensor_data) for n in NAMES}
+        self.depth = {n: make(Image, f"{n}/{images.DEPTH}", qos_profile_sensor_data) for n in NAMES}
+        self.info = {n: make(CameraInfo, f"{n}/{images.INFO}", qos_profile_sensor_data) for n in NAMES}
+        self.pose = {n: make(PoseStamped, f"{n}/{images.POSE}", qos.latched()) for n in NAMES}
+        self.frames: list[PointFrame] = []
+        bench.world.create_subscription(PointCloud2, TRACKER_POINTS, self._on_points, qos.points_complete())
+        bench.until(lambda: all(p.get_subscription_count() for p in self.color.values()), "the node listens")
+
+    def _on_points(self, message: PointCloud2) -> None:
+        self.frames.append(convert.cloud_to_points(message))
+
+    def calibrate(self, frame: CameraFrame, name: str, world: str = "world") -> None:
+        """Publish calibration and pose."""
+        height, width = frame.depth.shape
+        k = frame.intrinsics.ravel().tolist()
+        self.info[name].publish(CameraInfo(header=convert.header_at(START), height=height, width=width, k=k))
+        w, x, y, z = images.rotation_of(frame.world_from_camera).tolist()
+        px, py, pz = frame.world_from_camera[:3, 3].tolist()
+        pose = Pose(position=Point(x=px, y=py, z=pz), orientation=Quaternion(w=w, x=x, y=y, z=z))
+        self.pose[name].publish(PoseStamped(header=convert.header_at(START, world), pose=pose))
+
+    def show(self, frame: CameraFrame, name: str, depth_frame: str = "") -> None:
+        """Publish a picture."""
+        height, width = frame.depth.shape
+        optical = images.optical_frame(name)
+        color = Image(header=convert.header_at(frame.stamp, optical), height=height, width=width, encoding="rgb8")
+        color.step, color.data = 3 * width, array("B", frame.rgb.tobytes())
+        depth = Image(header=convert.header_at(frame.stamp, depth_frame or optical), height=height, width=width)
+        depth.encoding, depth.step, depth.data = "32FC1", 4 * width, array("B", frame.depth.tobytes())
+        self.color[name].publish(color)
+        self.depth[name].publish(depth)
+
+    def all(self, stamp: int, **changes: Any) -> None:
+        """Gripper and both cameras at one stamp."""
+        self.bench.closed_out.publish(convert.closed_to_message(np.array([True])))
+        self.bench.pose_out.publish(convert.pose_to_message(PoseFrame(stamp, self.scene.gripper[None], TURN)))
+        for name, frame in self.scene.frames(stamp).items():
+            self.calibrate(frame, name)
+            self.show(dataclasses.replace(frame, **changes), name)
+
+    def until_found(self) -> None:
+        """Show pictures until particles come; the first ones may arrive before their calibration."""
+        for k in range(40):
+            count = len(self.frames)
+            self.all(START + k * STEP)
+            self.bench.until(lambda n=count, s=k: len(self.frames) > n or self._idle(s), "an answer", 30.0)
+            if len(self.frames) >= 2:
+                return
+        raise AssertionError(f"never found; node says {self.bench.node.diagnostics.message}")
+
+    def show_until(self, condition: Callable[[], bool], names: Sequence[str], limit: float = 15.0) -> None:
+        """Go on with pictures of some cameras; diagnostics come once a second and want fresh ones."""
+        end = time.monotonic() + limit
+        while not condition():
+            assert time.monotonic() < end, self.bench.node.diagnostics.message
+            count, stamp = len(self.frames), self.frames[-1].stamp + STEP
+            for name, frame in self.scene.frames(stamp).items():
+                if name in names:
+                    self.show(frame, name)
+            self.bench.until(lambda n=count: len(self.frames) > n, "particles")
+
+    def _idle(self, sent: int) -> bool:
+        return self.bench.node.diagnostics.counter("refused messages") > 0 and sent < 20
+
+
+@pytest.fixture(scope="module")
+def scene() -> Iterator[HangingRope]:
+    made = HangingRope(cameras=2)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def rig(scene: HangingRope) -> Iterator[Rig]:
+    scene.move(np.zeros(3))
+    with bench_of(TrackerNode, PARAMETERS, feeds=False) as bench:
+        yield Rig(bench, scene)
+
+
+def test_particles_lie_on_the_rope_and_carry_the_capture_stamp(rig: Rig) -> None:
+    rig.until_found()
+    last = rig.frames[-1]
+    assert (last.stamp - START) % STEP == 0
+    assert last.id.tolist() == list(range(26))
+    error = np.linalg.norm(last.position - rig.scene.truth(26), axis=-1)
+    # Two cameras of 320 x 240: a pixel is 3.3 mm at 1 m; a rope's end is known to about one of them.
+    assert error.mean() < 0.004 and error.max() < 0.012
+    assert last.visible.all()
+    length = np.linalg.norm(np.diff(last.position, axis=0), axis=-1).sum()
+    assert length == pytest.approx(LENGTH, abs=0.01)
+    rig.show_until(lambda: rig.bench.says(OK, "tracking"), NAMES)
+
+
+def test_one_dead_camera_is_named_and_the_other_goes_on(rig: Rig) -> None:
+    rig.until_found()
+    rig.show_until(lambda: rig.bench.says(WARN, "tracking without cam1"), ("cam0",))
+
+
+def test_camera_pose_in_another_frame_is_refused(rig: Rig) -> None:
+    rig.calibrate(rig.scene.frames(START)["cam0"], "cam0", world="map")
+    rig.bench.until(lambda: rig.bench.says(ERROR, "cam0/pose", "map", "world"), "an error that names the frame")
+
+
+def test_missing_calibration_is_named(rig: Rig) -> None:
+    rig.show(rig.scene.frames(START)["cam1"], "cam1")
+    rig.bench.until(lambda: rig.bench.says(ERROR, "cam1", "calibration missing", "camera_info"), "an error")
+    assert rig.bench.node.exit_code is None
+
+
+def test_depth_that_is_all_nan_is_named_and_the_run_goes_on(rig: Rig) -> None:
+    rig.until_found()
+    stamp = rig.frames[-1].stamp + STEP
+    rig.all(stamp, depth=np.full((240, 320), np.nan, np.float32))
+    rig.bench.until(lambda: rig.bench.says(ERROR, "no pixel has a depth"), "an error that names the camera")
+    count = len(rig.frames)
+    rig.all(stamp + STEP)
+    rig.bench.until(lambda: len(rig.frames) > count, "particles again")
+
+
+def test_depth_of_another_frame_is_refused(rig: Rig) -> None:
+    frame = rig.scene.frames(START)["cam0"]
+    for _ in range(20):
+        rig.calibrate(frame, "cam0")
+        rig.show(frame, "cam0", depth_frame="cam0_depth_optical_frame")
+        for _ in range(20):
+            rig.bench.executor.spin_once(timeout_sec=0.01)
+        if rig.bench.says(ERROR, "not registered"):
+            break
+    assert rig.bench.says(ERROR, "cam0", "not registered", "cam0_depth_optical_frame")
+
+
+def test_zero_cameras_end_the_node_with_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+    with own_domain():
+        rclpy.init(args=["--ros-args", "-p", "cameras:=''"])
+        node = TrackerNode()
+        try:
+            node.trigger_configure()
+            assert node.exit_code == 2
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()
+    assert "parameter 'cameras'; got ''; allowed: 1 to 8" in capfd.readouterr().err
+
+
+def test_lists_in_parameters() -> None:
+    assert parse_cameras("cam0, cam3") == ["cam0", "cam3"]
+    with pytest.raises(ConfigError, match="1 to 8"):
+        parse_cameras(" ".join(f"cam{i}" for i in range(9)))
+    box = parse_fixtures("0.1 0 0.05 0.006 0.045 0.05;")[0]
+    assert box.center == (0.1, 0.0, 0.05) and box.half_size == (0.006, 0.045, 0.05)
+    with pytest.raises(ConfigError, match="six numbers"):
+        parse_fixtures("0.1 0")
