@@ -9,7 +9,7 @@ SHARE = f"share/{PACKAGE}"
 ROOT = Path(__file__).parent
 
 # `ros2 run pred_ros NAME` and the script `NAME` of a pip install.
-NODES = ("player", "tracker", "predictor", "evaluator", "planner", "arm")
+NODES = ("player", "plant", "tracker", "predictor", "evaluator", "planner", "arm")
 
 CORE = [
     "cma",

@@ -25,6 +25,7 @@ from pred_core.arm.follower import Follower
 from pred_core.arm.guard import Guard, Mode
 from pred_core.arm.limits import GuardConfig, bounds_of
 from pred_core.arm.placement import Placement
+from pred_core.arm.plant import HOST, PORT, connect_plant
 from pred_core.arm.protocol import Arm, Reading
 from pred_core.arm.step_check import StepCheck
 from pred_core.arm.ur import connect_ur
@@ -44,8 +45,9 @@ ACTIVE = (Mode.HOLDING, Mode.MOVING, Mode.RAMPING)
 class ArmConfig(GuardConfig):
     """Parameters of the arm node: the limits, and which arm stands where."""
 
-    arm: str = setting("dry_run", choices=("dry_run", "ur", "xarm"), doc="which arm")
-    host: str = setting("", doc="address of the arm's controller")
+    arm: str = setting("dry_run", choices=("dry_run", "plant", "ur", "xarm"), doc="which arm")
+    host: str = setting("", doc="address of the arm's controller; of a plant, this machine unless told otherwise")
+    port: int = setting(PORT, low=1, high=65535, doc="of a plant's controller")
     source: str = setting("plan", choices=("plan", "command"), doc="follow plan/trajectory or gripper/command")
     lifetime: float = setting(3.0, unit="s", low=0.1, high=600.0, doc="age at which a plan is followed no more")
     base_x: float = setting(0.0, unit="m", low=-5.0, high=5.0, doc="the arm's base in world")
@@ -63,6 +65,8 @@ def make_arm(config: ArmConfig) -> Arm:
     if config.arm == "dry_run":
         home = np.array([config.home_x, config.home_y, config.home_z])
         return DryRunArm(home, orientation.DOWN if config.tool_down else orientation.UP)
+    if config.arm == "plant":
+        return connect_plant(config.host or HOST, config.port)
     if not config.host:
         raise ConfigError(f"parameter 'host' is empty, arm '{config.arm}' needs one", next_step="-p host:=192.168.1.2")
     base = np.array([config.base_x, config.base_y, config.base_z])

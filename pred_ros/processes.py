@@ -20,7 +20,7 @@ from pred_ros.resources import fastdds_profile
 
 # A node started with this variable ends when its parent is gone, however that ended.
 END_WITH_PARENT = "PRED_END_WITH_PARENT"
-NODES = ("player", "tracker", "predictor", "evaluator", "planner", "arm")
+NODES = ("player", "plant", "tracker", "predictor", "evaluator", "planner", "arm")
 POLITE = 4.0  # [s] between SIGINT and SIGKILL
 
 # DDS-RTPS 9.6.2.3: port of the first participant's discovery = 7400 + 250 domain + 10.

@@ -35,6 +35,16 @@ def command() -> QoSProfile:
     return _profile(1, DurabilityPolicy.VOLATILE)
 
 
+def images() -> QoSProfile:
+    """Pictures, as camera drivers send them: the newest few, none twice."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=LIVE_DEPTH,
+        reliability=ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.VOLATILE,
+    )
+
+
 def latched(depth: int = 1) -> QoSProfile:
     """What a late reader must still get: gripper/closed, episode marks, camera poses, goals."""
     return _profile(depth, DurabilityPolicy.TRANSIENT_LOCAL)

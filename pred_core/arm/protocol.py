@@ -1,4 +1,4 @@
-"""What every arm understands, and nothing more. Adapters: dry_run.py, ur.py, xarm.py; a simulated world fits in too."""
+"""What every arm understands, and nothing more. Adapters: dry_run.py, plant.py, ur.py, xarm.py."""
 
 from __future__ import annotations
 

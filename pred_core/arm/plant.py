@@ -1,0 +1,82 @@
+"""The stand-in arm of the plant node, reached over TCP like any controller: one line of JSON a request."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pred_core.arm.protocol import Reading, SetPoint
+from pred_core.errors import InputError
+
+HOST, PORT = "127.0.0.1", 7654
+PATIENCE = 2.0  # [s] to connect, and for a reply
+START_IT = "Start the plant node, and give both the same port"
+
+
+class PlantArm:
+    """An arm in the plant's controller. Works in world; the controller stops by itself 0.1 s after a set-point."""
+
+    def __init__(self, connection: socket.socket):
+        self._connection, self._replies = connection, connection.makefile("rb")
+
+    def read(self) -> Reading:
+        """Measured pose, joints, jaws. Raises: InputError without connection or answer."""
+        reply = self._ask({"do": "read"})
+        position, rotation = np.array(reply["position"], float), [float(v) for v in reply["rotation"]]
+        if position.shape != (3,) or len(rotation) != 4 or not np.isfinite([*position.tolist(), *rotation]).all():
+            raise InputError("plant: the controller reports no pose", got=f"{reply['position']} {reply['rotation']}")
+        joints = {str(k): float(v) for k, v in reply["joints"].items()}
+        turned = (rotation[0], rotation[1], rotation[2], rotation[3])
+        return Reading(position, turned, bool(reply["ready"]), str(reply["message"]), bool(reply["closed"]), joints)
+
+    def begin(self) -> None:
+        """Take set-points from now on. Raises: InputError after a fault, which only the plant's ~/clear ends."""
+        self._ask({"do": "begin"})
+
+    def command(self, setpoint: SetPoint) -> None:
+        """Follow this set-point. Raises: InputError before `begin` and after a fault."""
+        self._ask(
+            {
+                "do": "command",
+                "position": setpoint.position.tolist(),
+                "rotation": list(setpoint.rotation),
+                "velocity": setpoint.velocity.tolist(),
+                "angular_velocity": setpoint.angular_velocity.tolist(),
+            }
+        )
+
+    def stop(self) -> None:
+        """Come to rest, follow nothing."""
+        self._ask({"do": "stop"})
+
+    def close(self) -> None:
+        """Hang up; the controller stops the arm then."""
+        self._replies.close()
+        self._connection.close()
+
+    def _ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        try:
+            self._connection.sendall(json.dumps(request).encode() + b"\n")
+            line = self._replies.readline()
+        except OSError as error:
+            raise InputError("plant: connection lost", got=error, next_step=START_IT) from error
+        if not line:
+            raise InputError("plant: the controller hung up", next_step=START_IT)
+        reply = json.loads(line)
+        if not reply["ok"]:
+            raise InputError(str(reply["error"]))
+        return dict(reply)
+
+
+def connect_plant(host: str = HOST, port: int = PORT) -> PlantArm:
+    """Connect to a plant node. Raises: InputError if nobody answers."""
+    try:
+        connection = socket.create_connection((host, port), timeout=PATIENCE)
+    except OSError as error:
+        raise InputError(f"plant: nobody at {host}:{port}", got=error, next_step=START_IT) from error
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return PlantArm(connection)

@@ -1,0 +1,225 @@
+"""The plant node: the topics of real cameras and a real arm, two clocks, faults, and the arm node that drives it."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not installed")
+pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+
+from geometry_msgs.msg import PoseArray, PoseStamped
+from rclpy.parameter import Parameter
+from ros_bench import Bench, bench_of
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2
+from std_msgs.msg import UInt8MultiArray
+from std_srvs.srv import SetBool, Trigger
+
+from pred_core.arm import plant as plant_arm
+from pred_core.arm.protocol import SetPoint
+from pred_core.bag import images
+from pred_core.bag.clouds import read_tracker_points
+from pred_core.bag.grippers import PoseFrame
+from pred_core.bag.wire import stamp_of
+from pred_core.errors import InputError
+from pred_core.plant.live import controller
+from pred_ros import convert, qos
+from pred_ros.diagnostics import WARN
+from pred_ros.plant_node import PlantNode
+
+FAST = {"cameras": "0", "mover": "free"}
+SMALL = {"cameras": "2", "width": "160", "height": "120", "camera_rate": "15.0"}
+
+
+class World:
+    """What hears the plant."""
+
+    def __init__(self, bench: Bench):
+        self.bench = bench
+        self.clock: list[int] = []
+        self.poses: list[PoseArray] = []
+        self.closed: list[UInt8MultiArray] = []
+        self.joints: list[JointState] = []
+        self.truth: list[PointCloud2] = []
+        self.color: dict[str, list[Image]] = {"cam0": [], "cam1": []}
+        self.depth: list[Image] = []
+        self.info: list[CameraInfo] = []
+        self.camera_poses: list[PoseStamped] = []
+        hear = bench.world.create_subscription
+        hear(Clock, "/clock", lambda m: self.clock.append(m.clock.sec * 10**9 + m.clock.nanosec), 100)
+        hear(PoseArray, "gripper/pose", self.poses.append, qos.points_complete())
+        hear(UInt8MultiArray, "gripper/closed", self.closed.append, qos.latched())
+        hear(JointState, "joint_states", self.joints.append, 100)
+        hear(PointCloud2, "/plant/truth", self.truth.append, qos.points_complete())
+        for name, heard in self.color.items():
+            hear(Image, f"{name}/color/image_raw", heard.append, qos.images())
+        hear(Image, "cam0/depth/image_raw", self.depth.append, qos.images())
+        hear(CameraInfo, "cam0/color/camera_info", self.info.append, qos.images())
+        hear(PoseStamped, "cam0/pose", self.camera_poses.append, qos.latched())
+        self.command_out = bench.world.create_publisher(PoseArray, "gripper/command", qos.command())
+        bench.until(lambda: self.clock, "the clock")
+
+    def ask(self, service: str, kind: type = Trigger, **request: Any) -> Any:
+        client = self.bench.world.create_client(kind, f"/plant/{service}")
+        self.bench.until(client.service_is_ready, "the service")
+        answer = client.call_async(kind.Request(**request))
+        self.bench.until(answer.done, "an answer")
+        return answer.result()
+
+    def place(self) -> np.ndarray:
+        p = self.poses[-1].poses[0].position
+        return np.array([p.x, p.y, p.z])
+
+    def command(self, place: np.ndarray, ahead: float) -> int:
+        """A pose to be reached `ahead` [s] from now; returns its stamp."""
+        stamp = self.clock[-1] + round(ahead * 1e9)
+        q = self.poses[-1].poses[0].orientation
+        self.bench.until(lambda: self.command_out.get_subscription_count() == 1, "the plant listens")
+        self.command_out.publish(
+            convert.pose_to_message(PoseFrame(stamp, place[None], np.array([[q.w, q.x, q.y, q.z]])))
+        )
+        return stamp
+
+
+@contextmanager
+def plant(**parameters: object) -> Iterator[World]:
+    with bench_of(PlantNode, {k: str(v) for k, v in parameters.items()}, feeds=False) as bench:
+        yield World(bench)
+
+
+def lockstep(**more: object) -> Any:
+    return plant(clock="step", drive="command", truth="true", **{**SMALL, **more})
+
+
+def test_lock_step_speaks_the_wire_and_repeats_bit_for_bit() -> None:
+    def run() -> tuple[World, bytes, list[int]]:
+        with lockstep(seed=2) as world:
+            world.bench.until(lambda: world.poses and world.closed and world.color["cam1"], "the first moment")
+            first = world.clock[-1]
+            time.sleep(0.2)
+            world.bench.executor.spin_once(timeout_sec=0.1)
+            assert world.clock[-1] == first == 1_000_000_000, "time stands still"
+            stamp = world.command(world.place() + [0.0, 0.02, 0.02], 0.2)
+            world.bench.until(lambda: world.clock[-1] >= stamp, "time goes on")
+            world.bench.until(lambda: stamp_of(world.truth[-1]) == stamp, "the pictures of that time")
+            world.bench.until(lambda: stamp_of(world.depth[-1]) == stamp, "depth")
+            return world, bytes(world.depth[-1].data) + bytes(world.truth[-1].data), world.clock
+
+    world, bits, clock = run()
+    assert np.diff(clock) == pytest.approx(np.full(30, 1e9 / 150), abs=1.0), "0.2 s are 30 ticks"
+    assert world.place() is not None and world.closed[-1].data.tolist() == [1]
+    assert len(world.joints[-1].name) == 7
+    color = images.read_color(world.color["cam0"][-1], "cam0")
+    depth = images.read_depth(world.depth[-1], "cam0")
+    assert color.shape == (120, 160, 3) and np.nanmedian(depth) == pytest.approx(1.0, abs=0.3)
+    assert world.depth[-1].header.frame_id == "cam0_color_optical_frame"
+    # The middle of the picture looks at the workplace, 1 m away: half of the pixels there measure it.
+    pose, (k, _) = images.read_camera_pose(world.camera_poses[-1], "p"), images.read_camera_info(world.info[-1], "i")
+    ray = pose[:3, :3] @ np.linalg.inv(k) @ [79.5, 59.5, 1.0]
+    assert pose[:3, 3] + ray == pytest.approx([0.45, 0.0, 0.03], abs=1e-6)
+    rope = read_tracker_points(world.truth[-1], "t").position
+    assert np.linalg.norm(rope[0] - world.place()) < 0.002
+    assert bits == run()[1], "the same seed, the same pictures and the same rope"
+
+
+def test_lock_step_refuses_what_it_cannot_do_and_steps_on_request() -> None:
+    with plant(clock="step", drive="command", **FAST) as world:
+        world.bench.until(lambda: world.poses, "a pose")
+        before = world.clock[-1]
+        world.command(world.place(), -0.1)
+        world.bench.until(lambda: world.bench.says(WARN, "its stamp says when"), "a refusal")
+        world.command(world.place() + [1.0, 0.0, 0.0], 0.1)
+        world.bench.until(lambda: world.bench.says(WARN, "too far for its time"), "another")
+        assert world.clock[-1] == before
+        answer = world.ask("step")
+        assert answer.success
+        world.bench.until(lambda: world.clock[-1] == before + 33_333_333 or world.clock[-1] == before + 33_333_334, "")
+
+
+def test_free_time_runs_and_publishes_its_factor() -> None:
+    with plant(drive="command", factor="0.5", **FAST) as world:
+        world.bench.until(lambda: len(world.clock) > 150, "two seconds")
+        begin, wall = world.clock[-1], time.monotonic()
+        goal = world.place() + [0.0, 0.0, 0.05]
+
+        def there() -> bool:
+            world.command(goal, 0.0)
+            world.bench.executor.spin_once(timeout_sec=0.02)
+            return bool(np.linalg.norm(world.place() - goal) < 0.003)
+
+        world.bench.until(there, "it goes where it is told")
+        world.bench.until(lambda: time.monotonic() - wall > 1.0, "a second")
+        assert (world.clock[-1] - begin) * 1e-9 < 0.6 * (time.monotonic() - wall), "half of real time, not more"
+        world.bench.node.heartbeat()
+        factor = float(world.bench.node.diagnostics._values["real-time factor"])
+        assert 0.05 < factor < 0.56
+
+
+def test_faults_by_parameter_and_service() -> None:
+    with lockstep(mover="free", step=0.2) as world:
+        world.bench.until(lambda: world.color["cam0"] and world.color["cam1"], "both cameras")
+        refused = world.bench.node.set_parameters([Parameter("dead_cameras", value="cam5")])[0]
+        assert not refused.successful and "unknown camera 'cam5'" in refused.reason
+        assert world.bench.node.set_parameters([Parameter("dead_cameras", value="cam1")])[0].successful
+        seen = len(world.color["cam1"])
+        assert world.ask("step").success
+        world.bench.until(lambda: len(world.color["cam0"]) >= 3, "the other one lives")
+        assert len(world.color["cam1"]) == seen
+        same = world.bench.node.set_parameters([Parameter("gap", value=0.05)])[0]
+        assert not same.successful and "while the plant is active" in same.reason
+        assert world.ask("slip").success
+        assert "nothing in them" in world.ask("jaws", SetBool, data=False).message
+        before = world.clock[-1]
+        assert world.ask("reset").success
+        world.bench.until(lambda: world.clock[-1] > before, "time goes on over a reset")
+        assert "the rope in them" in world.ask("jaws", SetBool, data=True).message
+
+
+def test_an_arm_drives_it_through_the_port_and_stops_when_it_is_silent() -> None:
+    with plant(port="0", **FAST) as world:
+        world.bench.until(lambda: len(world.clock) > 10, "it runs")
+        assert not world.poses, "gripper/pose is the arm node's then"
+        port = int(world.bench.node.diagnostics._values["port"])
+        arm = plant_arm.connect_plant(port=port)
+        start = arm.read()
+        assert start.ready and start.closed and start.message == "idle"
+        setpoint = SetPoint(start.position + [0.0, 0.0, 0.03], start.rotation, np.zeros(3), np.zeros(3))
+        with pytest.raises(InputError, match="before the arm was enabled"):
+            arm.command(setpoint)
+        arm.begin()
+
+        def there() -> bool:
+            arm.command(setpoint)
+            return bool(arm.read().position[2] > start.position[2] + 0.028)
+
+        world.bench.until(there, "it follows")
+        far = SetPoint(start.position + [0.0, 0.0, 0.3], start.rotation, np.zeros(3), np.zeros(3))
+        arm.command(far)
+        begin = world.clock[-1]
+        world.bench.until(lambda: world.clock[-1] - begin > 5e8, "half a second of silence")
+        height = arm.read().position[2]
+        # 0.1 s at 1 m/s, the controller's own limit, and some stopping
+        assert height < start.position[2] + 0.03 + 0.15
+        begin = world.clock[-1]
+        world.bench.until(lambda: world.clock[-1] - begin > 2e8, "more silence")
+        assert arm.read().position[2] == pytest.approx(height, abs=1e-3), "at rest"
+        arm.stop()
+        arm.close()
+        with socket.create_connection(("127.0.0.1", port)) as raw:
+            for line in (b"nonsense\n", b"[1]\n", b'{"do": "fly"}\n', b'{"do": "command"}\n'):
+                raw.sendall(line)
+                assert json.loads(raw.recv(4096))["ok"] is False
+    assert plant_arm.PORT == controller.PORT
+
+
+def test_nobody_at_the_port_is_said() -> None:
+    with pytest.raises(InputError, match="nobody at 127.0.0.1:9.*Start the plant node"):
+        plant_arm.connect_plant(port=9)
