@@ -25,7 +25,8 @@ def noise_of(episodes: Sequence[Episode]) -> float:
         sizes = np.abs(third).reshape(len(third), third.shape[1] * 3)
         median = np.array([np.nanmedian(row) for row in sizes if np.isfinite(row).any()])
         if len(median):
-            found.append(1.4826 * float(np.quantile(median, CALM)) / np.sqrt(20.0))
+            by_chance = 1.0 - 1.49 / np.sqrt(sizes.shape[1])  # the tenth quantile of such a median over its mean
+            found.append(1.4826 * float(np.quantile(median, CALM)) / np.sqrt(20.0) / max(by_chance, 0.5))
     return float(np.median(found)) if found else 0.0
 
 

@@ -24,6 +24,8 @@ def mean_levers(recordings: Sequence[Recording], ids: Sequence[int]) -> tuple[Le
             frames = torch.arange(len(holder))
             place, turn = r.grips.position[frames, holder].double(), r.grips.rotation[frames, holder].double()
             lever = quaternion_rotate(quaternion_conjugate(turn), r.position[:, column].double() - place)
+            if r.estimated is not None and bool(r.estimated[column]):
+                continue
             seen = (r.held[:, column] >= 0) & torch.isfinite(lever).all(dim=-1)
             if seen.any():
                 found.setdefault(ids[column], []).append(lever[seen].median(dim=0).values)
