@@ -34,9 +34,7 @@ class LineConfig:
     acceleration: float = setting(10.0, unit="m/s^2", low=0.1, high=1000.0, doc="that the motion prior allows for")
     bridge: float = setting(0.08, unit="m", low=0.0, high=0.5, doc="longest end hidden in a gripper's jaws")
     seen: float = setting(1.5, low=0.1, high=100.0, doc="points of one camera at a particle that make it visible")
-    doubt: float = setting(
-        0.96, low=0.0, high=1.0, doc="share of points explained less nodes contradicted; below, look anew"
-    )
+    doubt: float = setting(0.96, low=0.0, high=1.0, doc="points explained less nodes contradicted; below, look anew")
     lost: float = setting(0.5, low=0.0, high=1.0, doc="share of the points on the line below which it is lost")
     patience: float = setting(0.4, unit="s", low=0.0, high=10.0, doc="how long before it is searched anew")
     tolerance: float = setting(0.15, low=0.01, high=1.0, doc="relative difference of length when it is found again")
