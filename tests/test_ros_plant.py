@@ -22,6 +22,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2
 from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
+from test_arm_node import arm_world
 
 from pred_core.arm import plant as plant_arm
 from pred_core.arm.protocol import SetPoint
@@ -31,10 +32,15 @@ from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import stamp_of
 from pred_core.errors import InputError
 from pred_core.plant.live import controller
+from pred_core.plant.live.cell import Cell, CellConfig
+from pred_core.plant.live.controller import Controller
+from pred_core.plant.live.station import TICK, Station
 from pred_ros import convert, qos
-from pred_ros.diagnostics import WARN
+from pred_ros.diagnostics import ERROR, WARN
+from pred_ros.paced_worker import PacedWorker
 from pred_ros.plant_node import PlantNode
 
+ROOM = {"x_low": 0.2, "x_high": 0.7, "clearance": 0.015, "rate": 50.0}
 FAST = {"cameras": "0", "mover": "free"}
 SMALL = {"cameras": "2", "width": "160", "height": "120", "camera_rate": "15.0"}
 
@@ -54,7 +60,7 @@ class World:
         self.info: list[CameraInfo] = []
         self.camera_poses: list[PoseStamped] = []
         hear = bench.world.create_subscription
-        hear(Clock, "/clock", lambda m: self.clock.append(m.clock.sec * 10**9 + m.clock.nanosec), 100)
+        hear(Clock, "/clock", self._on_clock, 100)
         hear(PoseArray, "gripper/pose", self.poses.append, qos.points_complete())
         hear(UInt8MultiArray, "gripper/closed", self.closed.append, qos.latched())
         hear(JointState, "joint_states", self.joints.append, 100)
@@ -67,7 +73,10 @@ class World:
         self.command_out = bench.world.create_publisher(PoseArray, "gripper/command", qos.command())
         bench.until(lambda: self.clock, "the clock")
 
-    def ask(self, service: str, kind: type = Trigger, **request: Any) -> Any:
+    def _on_clock(self, message: Clock) -> None:
+        self.clock.append(message.clock.sec * 10**9 + message.clock.nanosec)
+
+    def ask(self, service: str, kind: Any = Trigger, **request: Any) -> Any:
         client = self.bench.world.create_client(kind, f"/plant/{service}")
         self.bench.until(client.service_is_ready, "the service")
         answer = client.call_async(kind.Request(**request))
@@ -218,6 +227,40 @@ def test_an_arm_drives_it_through_the_port_and_stops_when_it_is_silent() -> None
                 raw.sendall(line)
                 assert json.loads(raw.recv(4096))["ok"] is False
     assert plant_arm.PORT == controller.PORT
+
+
+def test_the_arm_node_follows_commands_with_it_and_stops_at_its_fault() -> None:
+    """The guard's set-points at 50 Hz, on two free clocks, move the stand-in arm where it is told."""
+    station = Station(Cell(CellConfig(), cameras=()), pictures=False)
+    moment = station.reset(1)
+    served = Controller(station.servo, lambda: station.moment.truth, lambda: station.cell.time, 0)
+
+    def tick() -> None:
+        station.tick()
+
+    worker = PacedWorker(tick, TICK, lambda: 1.0, lambda _: None, lambda: None)
+    home = moment.truth.gripper.position
+    try:
+        with arm_world(arm="plant", port=served.port, source="command", **ROOM) as world:
+            world.bench.until(lambda: world.joints and len(world.joints[-1].name) == 7, "joint angles")
+            assert world.place() == pytest.approx(home, abs=2e-3)
+            assert world.enable().success
+            goal = home + [0.0, 0.02, 0.06]
+            q = moment.truth.gripper.rotation
+
+            def there() -> bool:
+                pose = PoseFrame(world.now(), goal[None], q[None])
+                world.command_out.publish(convert.pose_to_message(pose))
+                world.bench.executor.spin_once(timeout_sec=0.02)
+                return bool(np.linalg.norm(world.place() - goal) < 2e-3)
+
+            world.bench.until(there, "the arm is where it was told to be")
+            station.servo.fail("somebody pressed the red button")
+            world.bench.until(lambda: world.bench.says(ERROR, "red button"), "the fault is latched")
+            assert not world.enable().success
+    finally:
+        worker.end()
+        served.close()
 
 
 def test_nobody_at_the_port_is_said() -> None:
