@@ -1,0 +1,26 @@
+"""What a user may set of a diagnosis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pred_core.config import setting
+
+
+@dataclass(frozen=True)
+class DiagnoseConfig:
+    """Defaults are frozen: they were chosen on development cases, never on those that are reported."""
+
+    window: float = setting(1.6, unit="s", low=0.1, high=60.0, doc="length of a rollout between two starts from data")
+    stride: int = setting(2, low=1, high=50, doc="frames between the residuals that are read")
+    level: float = setting(0.05, low=1e-4, high=0.5, doc="family-wise error of a name")
+    gate: float = setting(0.1, low=0.0, high=1.0, doc="least share of the excess error closed, with a reference")
+    cold_gate: float = setting(0.25, low=0.0, high=1.0, doc="the same without a reference")
+    improved: float = setting(0.75, low=0.0, high=1.0, doc="least share of the episodes it acts in that improve")
+    enough: float = setting(0.6, low=0.0, high=1.0, doc="share of the excess closed from which a cause explains it")
+    survivors: int = setting(10, low=2, high=100, doc="candidates of the screening that are fitted to the end")
+    places: int = setting(48, low=4, high=1000, doc="places, or the like, where a localized cause is tried first")
+    iterations: int = setting(8, low=1, high=100, doc="steps of a refinement")
+    causes: int = setting(3, low=1, high=8, doc="most causes that are named together")
+    seconds: float = setting(300.0, unit="s", low=1.0, high=86400.0, doc="time it aims at; the screening always ends")
+    seed: int = setting(0, low=0, high=2**31 - 1, doc="of places, perturbed starts and sign flips")

@@ -1,0 +1,118 @@
+"""What held-out episodes say of each candidate: gains, family-wise significance, who else explains it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from pred_core.diagnose.trial import Trial
+from pred_core.types import Array
+
+FLIPS = 20_000
+ACTS = 0.02  # standard deviations of a residual by which a cause must move an episode to count as acting in it
+CONFIDENCE = 0.90  # of the set of causes that cannot be told apart
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One candidate after its fit and cross-fit."""
+
+    trial: Trial
+    values: dict[str, float]  # knob -> fitted value, on all train episodes
+    null: dict[str, float]  # knob -> value without the change: off, or what the reference says
+    intervals: dict[str, tuple[float, float]]  # 90 %, by leaving out recordings
+    gain: Array  # (E,) loss saved on each episode by parameters that did not see it
+    acts: NDArray[np.bool_]  # (E,) it moves the episode at all
+    extended: Array  # (E,) loss with it, parameters that did not see the episode
+    z: Array  # coordinates of `values`
+
+    @property
+    def mean(self) -> float:
+        """Mean gain over all episodes."""
+        return float(self.gain.mean())
+
+    @property
+    def parameters(self) -> int:
+        """Numbers it frees beyond those every candidate has."""
+        return sum("." in k.name for k in self.trial.space.knobs)
+
+    @property
+    def improved(self) -> tuple[int, int]:
+        """(episodes that improve, episodes in which it acts)."""
+        return int((self.gain[self.acts] > 0).sum()), int(self.acts.sum())
+
+    @property
+    def at_bound(self) -> dict[str, bool]:
+        """Knob -> it ended at a bound that is not its null."""
+        return {
+            k.name: k.at_bound(self.values[k.name]) and self.values[k.name] != k.null for k in self.trial.space.knobs
+        }
+
+    @property
+    def excludes_null(self) -> bool:
+        """The interval of a switch leaves out its null value."""
+        for n in self.trial.amplitudes:
+            knob = self.trial.space.knobs[n]
+            low, high = self.intervals[knob.name]
+            if low > self.null[knob.name] or high < self.null[knob.name]:
+                return True
+        return False
+
+
+def family_wise(judged: Sequence[Judged], seed: int) -> Array:
+    """(C,) p values, adjusted for the number of candidates: max-T over random sign flips (Westfall and Young 1993)."""
+    gains = np.stack([j.gain for j in judged])
+    generator = np.random.default_rng(seed)
+    signs = generator.choice((-1.0, 1.0), size=(FLIPS, gains.shape[1]))
+    observed = _studentized(gains)
+    scale = np.sqrt((gains**2).sum(axis=1))  # sum of squares does not change with signs
+    sums = signs @ gains.T  # (F, C)
+    count = gains.shape[1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        means = sums / count
+        variance = (scale**2 / count - means**2) * count / (count - 1)
+        flipped = np.where(variance > 0, means / np.sqrt(variance / count), 0.0)
+    largest = flipped.max(axis=1)
+    return np.asarray((1 + (largest[None] >= observed[:, None]).sum(axis=1)) / (1 + FLIPS))
+
+
+def _studentized(gains: Array) -> Array:
+    count = gains.shape[1]
+    spread = gains.std(axis=1, ddof=1)
+    return np.where(spread > 0, gains.mean(axis=1) / np.maximum(spread, 1e-300) * np.sqrt(count), 0.0)
+
+
+def rivals(judged: Sequence[Judged], best: Judged) -> list[tuple[Judged, float]]:
+    """(candidate, standard errors by which `best` saves more), best first: nothing else is below about 1.3."""
+    rows = []
+    for other in judged:
+        difference = best.gain - other.gain
+        error = float(difference.std(ddof=1)) / np.sqrt(len(difference))
+        rows.append((other, float(difference.mean()) / error if error > 0 else 0.0))
+    return sorted(rows, key=lambda row: row[1])
+
+
+def set_limit(episodes: int) -> float:
+    """Standard errors beyond which a candidate is told apart from the best."""
+    return float(student.ppf(CONFIDENCE, max(episodes - 1, 1)))
+
+
+def simplest(judged: Sequence[Judged], best: Judged) -> Judged:
+    """The candidate with fewest parameters that is not worse than `best` by more than one standard error."""
+    near = [j for j, z in rivals(judged, best) if z <= 1.0 and j.parameters < best.parameters and j.mean >= 0.9 * best.mean]
+    return min(near, key=lambda j: (j.parameters, -j.mean), default=best)
+
+
+def lack_of_fit(suspect: Array, reference: Array, seed: int) -> float:
+    """p value that episodes fit worse than the reference's: permutation of their log losses, one-sided."""
+    generator = np.random.default_rng(seed)
+    both = np.log(np.concatenate((suspect, reference)) + 1e-9)
+    count = len(suspect)
+    observed = both[:count].mean() - both[count:].mean()
+    draws = np.array([generator.permutation(both) for _ in range(4000)])
+    difference = draws[:, :count].mean(axis=1) - draws[:, count:].mean(axis=1)
+    return float((1 + (difference >= observed).sum()) / (1 + len(draws)))

@@ -1,0 +1,155 @@
+"""Fitting candidates on both sets and cross-fitting them on the suspect one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pred_core.diagnose.config import DiagnoseConfig
+from pred_core.diagnose.evidence import ACTS, Judged
+from pred_core.diagnose.fit import Fit, Target, fit, rho, without_groups
+from pred_core.diagnose.search import Start, coordinates, refine_trial, starts
+from pred_core.diagnose.trial import Trial, make_trial
+from pred_core.effects.effect import Effect
+from pred_core.identify.space import Candidate
+from pred_core.twin import Twin
+from pred_core.types import Array
+
+Tell = Callable[[str], None]
+Effects = tuple[type[Effect], ...]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The suspect set and, if there is one, the reference, each with the twin that describes it so far."""
+
+    twin: Twin
+    target: Target
+    reference_twin: Twin
+    reference: Target | None
+    config: DiagnoseConfig
+    physics: tuple[str, ...] = ()  # base parameters that every candidate refits: without a reference, all of them
+
+    @property
+    def train(self) -> NDArray[np.bool_]:
+        """(E,) episodes of the suspect set that are fitted; the others only judge."""
+        return np.array([s == "train" for s in self.target.roller.sample.splits])
+
+    def trial(self, effects: Effects) -> Trial:
+        """A candidate on the suspect set."""
+        return make_trial(self.twin, effects, self.physics)
+
+    def standing(self) -> Array:
+        """(E,) losses of the suspect set as the twin is."""
+        space = make_trial(self.twin, (), ()).space
+        return self.target.losses(space, [space.start()])[0]
+
+
+@dataclass(frozen=True)
+class Screened:
+    """A candidate and what a straight line promises of it."""
+
+    effects: Effects
+    trial: Trial
+    starts: list[Start]
+    promise: float
+    null: Array  # coordinates (in the suspect set's space) of no change
+
+
+def screen(bench: Bench, effects: Effects, rng: np.random.Generator) -> Screened:
+    """Where to start a candidate, and how much it promises beyond what the reference already gives it."""
+    trial = bench.trial(effects)
+    found = starts(bench.target, trial, bench.config.places, rng)
+    return Screened(effects, trial, found, found[0].promise, trial.space.start())
+
+
+def null_of(bench: Bench, screened: Screened, like: Array | None) -> Array:
+    """Coordinates of "no change": what the reference says of the candidate's parameters, else off.
+
+    `like`: coordinates the suspect set gives; the reference is fitted from there too, because what engine and object
+    lack in common would otherwise count as a change.
+    """
+    if bench.reference is None:
+        return screened.null
+    trial = make_trial(bench.reference_twin, screened.effects, ())
+    begins = [trial.space.start()]
+    if like is not None:
+        begins.append(_moved(screened.trial, trial, like, 0.2))
+    best = None
+    for begin in begins:
+        result = fit(bench.reference, trial.space, begin, max(3, bench.config.iterations // 2))
+        if best is None or result.loss.mean() < best.loss.mean():
+            best = result
+    assert best is not None
+    at_reference = trial.space.candidate(best.z)
+    freed = set(screened.trial.ids)
+    values = {e.id: e for e in at_reference.extensions if e.id in freed}
+    extensions = tuple(values.get(e.id, e) for e in screened.trial.space.extensions)
+    return coordinates(screened.trial.space, Candidate(screened.trial.space.physics, extensions))
+
+
+def judge(bench: Bench, screened: Screened, begin: Sequence[Array] = ()) -> tuple[Judged, Fit]:
+    """Fit on the train episodes, cross-fit by recordings, compare with no change on every episode."""
+    trial, space, target = screened.trial, screened.trial.space, bench.target
+    train = bench.train
+    found = [Start(z, 0.0) for z in begin] or screened.starts
+    result = refine_trial(target, trial, found, bench.config.iterations, train)
+    null = null_of(bench, screened, result.z)
+    sample = target.roller.sample
+    left_out = without_groups(result, space, sample.groups, train)
+    points = [null, result.z, *left_out.values()]
+    u = target.residuals(space, points)
+    losses = target.per_episode(rho(u))
+    extended = losses[1].copy()
+    for row, group in enumerate(left_out):
+        mine = train & (sample.groups == group)
+        extended[mine] = losses[2 + row][mine]
+    moved = np.sqrt(np.maximum(target.per_episode((u[1] - u[0]).square()[None])[0], 0.0))
+    spread = np.array(list(left_out.values())) if left_out else result.z[None]
+    values, nulls = space.values(result.z), space.values(null)
+    return (
+        Judged(
+            trial=trial,
+            values=values,
+            null=nulls,
+            intervals=_intervals(trial, result.z, spread),
+            gain=losses[0] - extended,
+            acts=moved > ACTS,
+            extended=extended,
+            z=result.z,
+        ),
+        result,
+    )
+
+
+def _moved(source: Trial, target: Trial, z: Array, share: float) -> Array:
+    """Coordinates in another trial's space, the switches reduced to a share of what they are."""
+    names = {k.name: n for n, k in enumerate(source.space.knobs)}
+    result = target.space.start()
+    for n, knob in enumerate(target.space.knobs):
+        if knob.name in names:
+            value = source.space.knobs[names[knob.name]].value(float(z[names[knob.name]]))
+            result[n] = knob.coordinate(value)
+    for n in target.amplitudes:
+        result[n] *= share
+    return result
+
+
+def _intervals(trial: Trial, z: Array, left_out: Array) -> dict[str, tuple[float, float]]:
+    """90 % by the jackknife over recordings (Efron 1982), as values."""
+    groups = len(left_out)
+    if groups < 2:
+        return {k.name: (k.low, k.high) for k in trial.space.knobs}
+    centre = left_out.mean(axis=0)
+    error = np.sqrt((groups - 1) / groups * ((left_out - centre) ** 2).sum(axis=0))
+    width = JACKKNIFE.get(groups, 1.8) * error
+    return {
+        k.name: (k.value(float(z[n] - width[n])), k.value(float(z[n] + width[n])))
+        for n, k in enumerate(trial.space.knobs)
+    }
+
+
+JACKKNIFE = {2: 6.31, 3: 2.92, 4: 2.35, 5: 2.13, 6: 2.02, 7: 1.94, 8: 1.89}  # Student's t, 95 %, groups - 1

@@ -1,0 +1,129 @@
+"""From a candidate to its best fit: where to start, a score that costs little, and the refinement."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pred_core.diagnose.fit import Fit, Target, fit, rho
+from pred_core.diagnose.trial import Trial, first_values, scanned
+from pred_core.effects import find_effect
+from pred_core.identify.space import Candidate, SearchSpace
+from pred_core.twin import Extension
+from pred_core.types import Array
+
+SECANT = 0.7  # typical changes of the switch, over which a first slope is taken
+TRIED = 3  # starts of a localized cause that are refined
+
+
+@dataclass(frozen=True)
+class Start:
+    """A place to refine from, and what a straight line promises there."""
+
+    z: Array
+    promise: float  # loss that the best step along the switches would save
+
+
+def starts(target: Target, trial: Trial, count: int, rng: np.random.Generator) -> list[Start]:
+    """Starts of a trial, most promising first."""
+    effects = [find_effect(i) for i in trial.ids]
+    scanning = [e for e in effects if scanned(e)]
+    space = trial.space
+    if not trial.amplitudes:
+        return [Start(space.start(), 0.0)]
+    null = space.start()
+    now = target.residuals(space, [null])
+    origins = [null]
+    if scanning:
+        size = (now[0] / target.weights[..., None].clamp_min(1e-9)).square().sum(-1).sqrt().numpy()
+        origins = []
+        drawn = [first_values(e, target.roller, size, count, rng) for e in scanning]
+        for row in zip(*drawn, strict=True):
+            values = {e.id: e for e in row}
+            extensions = tuple(
+                dataclasses.replace(e, parameters={**e.parameters, **_scanned_values(values[e.id])})
+                if e.id in values
+                else e
+                for e in space.extensions
+            )
+            origins.append(coordinates(space, Candidate(space.physics, extensions)))
+    upper = np.array(space.bounds()[1])
+    lower = np.array(space.bounds()[0])
+    points = []
+    steps = []
+    for origin in origins:
+        for a in trial.amplitudes:
+            step = SECANT if origin[a] + SECANT <= upper[a] else -SECANT
+            point = origin.copy()
+            point[a] = np.clip(origin[a] + step, lower[a], upper[a])
+            points.append(point)
+            steps.append(point[a] - origin[a])
+    moved = target.residuals(space, points)
+    found = []
+    k = len(trial.amplitudes)
+    for n, origin in enumerate(origins):
+        g, h = _normal(target, now[0], moved[n * k : (n + 1) * k], np.array(steps[n * k : (n + 1) * k]))
+        move = -np.linalg.solve(h + 1e-3 * np.diag(np.diag(h)) + 1e-9 * np.eye(k), g)
+        z = origin.copy()
+        amplitudes = list(trial.amplitudes)
+        z[amplitudes] = np.clip(origin[amplitudes] + np.clip(move, -3.0, 3.0), lower[amplitudes], upper[amplitudes])
+        actual = z[amplitudes] - origin[amplitudes]
+        promise = -float(g @ actual + 0.5 * actual @ h @ actual)
+        if scanning and not np.abs(actual).max() > 1e-6:
+            continue
+        found.append(Start(z, promise))
+    found.sort(key=lambda s: -s.promise)
+    return found or [Start(null, 0.0)]
+
+
+def refine_trial(
+    target: Target, trial: Trial, begin: list[Start], iterations: int, chosen: NDArray[np.bool_] | None = None
+) -> Fit:
+    """The best of the refinements from the first starts; a localized cause is refined from several."""
+    many = any(scanned(find_effect(i)) for i in trial.ids)
+    first = begin[: TRIED if many else 1]
+    if len(first) > 1:
+        short = [fit(target, trial.space, s.z, 2, chosen) for s in first]
+        best = min(short, key=lambda f: float(f.loss.mean()))
+        return fit(target, trial.space, best.z, iterations, chosen)
+    return fit(target, trial.space, first[0].z, iterations, chosen)
+
+
+def _scanned_values(extension: Extension) -> dict[str, tuple[float, ...]]:
+    effect = find_effect(extension.id)
+    return {q.name: extension.parameters[q.name] for q in scanned(effect)}
+
+
+def coordinates(space: SearchSpace, candidate: Candidate) -> Array:
+    """Coordinates of a candidate's values."""
+    values = {e.id: e.parameters for e in candidate.extensions}
+    z = space.start()
+    for n, knob in enumerate(space.knobs):
+        if "." in knob.name:
+            effect, rest = knob.name.split(".", 1)
+            name, index = rest[:-1].split("[")
+            z[n] = knob.coordinate(values[effect][name][int(index)])
+        else:
+            z[n] = knob.coordinate(float(getattr(candidate.physics, knob.name)))
+    return z
+
+
+def _normal(target: Target, now: torch.Tensor, moved: torch.Tensor, steps: Array) -> tuple[Array, Array]:
+    """Gradient (k,) and curvature (k, k) of the mean loss along the switches."""
+    slopes = (moved - now) / torch.as_tensor(steps, dtype=torch.float32).reshape(-1, 1, 1, 1, 1)
+    soft = (1.0 + now.square()).rsqrt()
+    g = target.per_episode(slopes * (now * soft)).mean(axis=1)
+    k = len(steps)
+    h = np.empty((k, k))
+    for a in range(k):
+        h[a] = target.per_episode(slopes * (slopes[a] * soft)).mean(axis=1)
+    return g, h
+
+
+def loss_of(target: Target, space: SearchSpace, z: Array) -> Array:
+    """(E,) losses at one point."""
+    return target.per_episode(rho(target.residuals(space, [z])))[0]

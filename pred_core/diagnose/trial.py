@@ -1,0 +1,95 @@
+"""One candidate cause: which parameters it frees, where a search begins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pred_core.diagnose.roll import Roller
+from pred_core.effects.effect import Effect, Parameter
+from pred_core.identify.space import SearchSpace, search_space
+from pred_core.twin import Extension, Twin
+from pred_core.types import Array
+
+# Effects that are measurement (corrected, not simulated) or too flexible to be a name: they would explain anything.
+NOT_A_NAME = ("bending_profile", "mass_profile", "rest_curvature")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Effects that are freed together, on top of what the twin already has."""
+
+    ids: tuple[str, ...]
+    family: str
+    space: SearchSpace
+    amplitudes: tuple[int, ...]  # knobs that switch it on
+    doubles: bool = False  # one of the ids stands in the twin already: its values are refitted
+
+    @property
+    def id(self) -> str:
+        """Name."""
+        return "+".join(self.ids)
+
+
+def make_trial(twin: Twin, effects: tuple[type[Effect], ...], physics: tuple[str, ...] = ()) -> Trial:
+    """A trial of these effects; `physics`: base parameters that are refitted with it."""
+    ids = tuple(e.id for e in effects)
+    standing = {e.id for e in twin.extensions}
+    space = search_space(twin.physics, physics, ids, twin.extensions)
+    amplitudes = []
+    for n, knob in enumerate(space.knobs):
+        effect = next((e for e in effects if knob.name.startswith(f"{e.id}.")), None)
+        if effect is None:
+            continue
+        parameter = _parameter(effect, knob.name)
+        if parameter is switch(effect):
+            amplitudes.append(n)
+    return Trial(ids, "+".join(dict.fromkeys(e.family for e in effects)), space, tuple(amplitudes), bool(standing & set(ids)))
+
+
+def switch(effect: type[Effect]) -> Parameter:
+    """The parameter that switches an effect on: the first."""
+    return effect.parameters[0]
+
+
+def scanned(effect: type[Effect]) -> tuple[Parameter, ...]:
+    """Parameters whose first values are tried in many places."""
+    return tuple(q for q in effect.parameters if q.scan)
+
+
+def _parameter(effect: type[Effect], knob: str) -> Parameter:
+    name = knob.split(".", 1)[1].split("[", 1)[0]
+    return next(q for q in effect.parameters if q.name == name)
+
+
+def first_values(effect: type[Effect], roller: Roller, error: Array, count: int, rng: np.random.Generator) -> list[Extension]:
+    """Extensions with the switch at its null and the scanned parameters drawn; one, if nothing is scanned.
+
+    `error` (W, K, N): size of the residual. Places are drawn where the residual is large, between what was predicted
+    and what was measured, because there something acts.
+    """
+    if not scanned(effect):
+        return [effect.extension()]
+    weight = error.reshape(-1) ** 2
+    weight = weight / weight.sum() if weight.sum() > 0 else np.full(weight.size, 1.0 / weight.size)
+    w = roller.sample.windows
+    stride = max(1, len(w.target) // error.shape[1])
+    target = w.target[stride - 1 :: stride].movedim(0, 1)[:, : error.shape[1]].reshape(-1, 3).numpy()
+    result = []
+    for n in range(count):
+        place = target[int(rng.choice(len(target), p=weight))] + rng.normal(0.0, 0.06, 3)
+        values: dict[str, tuple[float, ...]] = {}
+        for q in scanned(effect):
+            if q.scan == "place":
+                value = tuple(place.tolist())
+            elif q.scan == "floor":
+                value = tuple(place[:2].tolist())
+            elif q.scan == "arc":
+                value = (float(rng.uniform(q.low, q.high)),)
+            else:  # direction
+                angle = 2.0 * np.pi * n / count
+                value = (q.typical * float(np.cos(angle)), q.typical * float(np.sin(angle)))
+            values[q.name] = tuple(float(np.clip(v, q.low, q.high)) for v in value)
+        result.append(effect.extension(**values))
+    return result
