@@ -16,6 +16,7 @@ from pred_core.effects.bending_scale import BendingScale
 from pred_core.effects.tip_mass import TipMass
 from pred_core.errors import DatasetError
 from pred_core.evaluate.protocol import predict
+from pred_core.frames import quaternion_rotate
 from pred_core.springmass import SpringMass
 from pred_core.train.recordings import align, gather
 from pred_core.twin import Twin
@@ -68,6 +69,9 @@ def test_the_tip_is_followed_from_after_the_release(tmp_path: Path) -> None:
     # The held edge lies on the axis, its middle in the plane of the clamp's markers: half an edge to either side.
     np.testing.assert_allclose(first.position[0, :2, 1], [-LENGTH / 13, LENGTH / 13], atol=1e-7)
     assert first.held.tolist() == [0, 0] + [-1] * 6
+    # Laws of bending read the gripper's y axis, which must lie across the beam.
+    across = quaternion_rotate(first.grips.rotation[0, 0], torch.tensor([0.0, 1.0, 0.0]))
+    assert abs(float(across[1])) < 1e-6
     assert first.tracks.visible.all(axis=0).tolist() == [True, True] + [False] * 4 + [True, True]
     assert [e.split for e in dataset.entries] == ["train", "test"] and [e.recording for e in dataset.entries] == [0, 1]
 

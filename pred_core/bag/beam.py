@@ -38,6 +38,7 @@ RATE = 100.0  # [Hz] motion capture
 SIGMA = 0.000003  # [m] of the centre and the direction of three markers, each 0.002 to 0.009 mm
 PARTICLES = 8
 WORLD_FROM_FILE = [1, 2, 0]  # world axes x, y, z are these axes of the file
+CLAMP_ROTATION = (0.5**0.5, 0.0, 0.0, 0.5**0.5)  # wxyz: the gripper's x along the beam, its y across, as of jaws
 MARKERS = ("Tip - 1", "Tip - 2", "Tip - 3", "Base - 1", "Base - 2", "Base - 3")
 STILL = 10  # frames at the beginning of a take in which the beam is held
 RELEASED = 0.00005  # [m] by which the tip has dropped when it is let go
@@ -153,7 +154,7 @@ def beam_episode(source: BeamSource, index: int) -> Episode:
         tracks=Tracks(stamps, position, np.arange(PARTICLES, dtype=np.uint32), seen, seen.astype(np.float32)),
         grips=Grip(
             position=torch.as_tensor(clamp, dtype=torch.float32).expand(count, 1, 3).contiguous(),
-            rotation=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 1, 4).contiguous(),
+            rotation=torch.tensor(CLAMP_ROTATION).expand(count, 1, 4).contiguous(),
             closed=torch.ones(count, 1, dtype=torch.bool),
         ),
         held=held,
