@@ -32,15 +32,22 @@ OTHERS = 3  # tests besides the sensors': slide, table height, table tilt
 __all__ = ["GateCause", "GateResult", "measure"]
 
 
-def measure(episodes: Sequence[Episode], reference: Sequence[Episode] | None, twin: Twin) -> GateResult:
+def measure(
+    episodes: Sequence[Episode],
+    reference: Sequence[Episode] | None,
+    twin: Twin,
+    reference_calibration: Calibration | None = None,
+) -> GateResult:
     """Judge `episodes` against `reference` (of the same object, without the effect), else against the twin and zero.
 
-    Both are first corrected by the calibration the twin has. Raises: DatasetError without episodes.
+    Both are first corrected by the calibration the twin has; the reference by `reference_calibration` if that is given,
+    for a twin that was calibrated for `episodes` alone. Raises: DatasetError without episodes.
     """
     if not episodes:
         raise DatasetError("there are no episodes to judge", next_step="Give some episodes 'split: train'")
     suspect = [twin.calibration.correct(e) for e in episodes]
-    known = [twin.calibration.correct(e) for e in reference or ()]
+    before = twin.calibration if reference_calibration is None else reference_calibration
+    known = [before.correct(e) for e in reference or ()]
     sigma = noise_of(suspect)
     notes = list(clock_notes(suspect))
     if len(suspect) < FEWEST:

@@ -96,7 +96,7 @@ def normal_equations(
         if knots:
             hats = slide_hats(track.time[track.used][good], knots)
             shape = axes[good][:, :, slide_axis]  # (T, 3)
-            own += (hats * w[:, None]).T @ hats
+            own += (hats * (w * (shape * shape).sum(axis=1))[:, None]).T @ hats
             across[:, place] += (hats * w[:, None]).T @ (shape[:, None, :] @ j)[:, 0]
             pull += hats.T @ (w * (shape * r).sum(axis=1))
     if not knots:

@@ -77,7 +77,7 @@ class Joint:
         """Free the changes `free` (CHANGES,) bool; the others stay zero."""
         active = np.concatenate((np.ones(self.unknowns - CHANGES, bool), free))
         start = -self.at * ~active  # inactive changes go to zero
-        parts = [p for p in self._parts]
+        parts = self._parts
         total_m = sum(p.matrix for p in parts) + np.diag(1.0 / self._prior**2)
         total_g = sum(p.gradient for p in parts) - self.at_offset / self._prior**2
         step = self._solve(total_m, total_g, active, start)
@@ -91,7 +91,9 @@ class Joint:
                 off = group - group.mean(axis=0)
                 covariance += (len(group) - 1) / len(group) * off.T @ off
         inverse = np.zeros((self.unknowns, self.unknowns))
-        inverse[np.ix_(active, active)] = np.linalg.inv(total_m[np.ix_(active, active)])
+        own = total_m[np.ix_(active, active)]
+        size = _sizes(own)
+        inverse[np.ix_(active, active)] = np.linalg.inv(own / np.outer(size, size)) / np.outer(size, size)
         white = inverse[-CHANGES:, -CHANGES:]
         losses = np.array([p.loss(step) for p in parts[:count]])
         change = (self.at + step)[-CHANGES:]
@@ -194,5 +196,12 @@ class Joint:
     def _solve(self, matrix: Array, gradient: Array, active: Array, start: Array) -> Array:
         step = start.copy()
         right = gradient - matrix @ start
-        step[active] = start[active] + np.linalg.solve(matrix[np.ix_(active, active)], right[active])
+        own = matrix[np.ix_(active, active)]
+        size = _sizes(own)
+        step[active] = start[active] + np.linalg.solve(own / np.outer(size, size), right[active] / size) / size
         return step
+
+
+def _sizes(matrix: Array) -> Array:
+    """Square roots of the diagonal: unknowns differ by many orders of magnitude. The priors leave at least 1."""
+    return np.sqrt(np.maximum(np.diag(matrix), 1.0))
