@@ -62,7 +62,7 @@ def line_points(count: int = 6, spacing: float = 0.02) -> np.ndarray:
     return points
 
 
-def seen(stamp: int = 0, at: np.ndarray | None = None, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Observation:
+def seen(stamp: int = 0, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Observation:
     """The line at rest, first particle held by gripper 0."""
     points = torch.as_tensor(line_points() + np.array(offset), dtype=torch.float32)
     held = torch.full((len(points),), -1, dtype=torch.int32)

@@ -52,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
     """Plan, carry out in the twin's own simulation, write the report. Raises: PredError for unusable input."""
     if args.replans < 1 or args.seed < 0 or not args.step > 0.0 or not 0.0 <= args.settle <= 60.0:
         got = f"{args.replans}, {args.step}, {args.seed}, {args.settle}"
-        raise ConfigError("--replans, --step, --seed, --settle", got=got, allowed="1 or more, above 0 s, 0 or more, 0 to 60 s")
+        allowed = "1 or more, above 0 s, 0 or more, 0 to 60 s"
+        raise ConfigError("--replans, --step, --seed, --settle", got=got, allowed=allowed)
     if args.goal is None and args.shift is None:
         raise InputError("no goal was given", next_step="Give --goal CLOUD or --shift DX DY DZ")
     twin = Twin.load(args.twin)
@@ -96,8 +97,11 @@ def _settings(args: argparse.Namespace, seen: Observation) -> PlannerConfig:
         if not 0.0 < args.around <= 3.0:
             raise ConfigError("--around", got=args.around, allowed="above 0 to 3 m")
         low, high = seen.position.min(axis=0) - args.around, seen.position.max(axis=0) + args.around
-        box = {f"{axis}_{side}": float(v[k]) for side, v in (("low", low), ("high", high)) for k, axis in enumerate("xyz")}
-        config = dataclasses.replace(config, motion=dataclasses.replace(config.motion, **box))
+        motion = dataclasses.replace(
+            config.motion, x_low=float(low[0]), y_low=float(low[1]), z_low=float(low[2]),
+            x_high=float(high[0]), y_high=float(high[1]), z_high=float(high[2]),
+        )  # fmt: skip
+        config = dataclasses.replace(config, motion=motion)
         check_ranges(config.motion, "--around")
     return config
 

@@ -11,10 +11,11 @@ differences of neighbours over h, positions lie in the hull of the c: limits on 
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pred_core.types import Array
 
@@ -41,7 +42,7 @@ class Curve:
         return self.segments * self.spacing
 
     def displacement(self, times: Array) -> Array:
-        """(T, G, 4) way [m] and yaw [rad] gone since time 0, at times (T,) [s]; before 0 and after the end: as there."""
+        """(T, G, 4) way [m] and yaw [rad] gone since time 0, at times (T,) [s] clipped to the motion."""
         return np.tensordot(self._weights(times, 0), self.knots, axes=1)
 
     def velocity(self, times: Array) -> Array:
@@ -82,21 +83,20 @@ def first_knots(velocity: Array, acceleration: Array, spacing: float) -> Array:
     return np.stack((velocity - half, velocity + half))
 
 
-def turned(rotation: Array, yaw: Array) -> Array:
+def turned(rotation: NDArray[Any], yaw: NDArray[Any]) -> NDArray[Any]:
     """Rotations (..., 4) wxyz turned about world z by yaw (...) [rad]; leading axes broadcast."""
-    c, s = np.cos(0.5 * yaw), np.sin(0.5 * yaw)
+    half = 0.5 * np.asarray(yaw)
+    c, s = np.cos(half), np.sin(half)
     w, x, y, z = np.moveaxis(rotation, -1, 0)
-    return np.stack((c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w), axis=-1)
+    out = np.empty(np.broadcast_shapes(half.shape, w.shape) + (4,), c.dtype)
+    out[..., 0], out[..., 1] = c * w - s * z, c * x - s * y
+    out[..., 2], out[..., 3] = c * y + s * x, c * z + s * w
+    return out
 
 
 def displacement_weights(times: Array, segments: int, spacing: float) -> Array:
-    """(T, S + 2) matrix from velocity knots to the way gone at times (T,) [s] within the motion; kept."""
-    return _kept(tuple(np.asarray(times, float).tolist()), segments, spacing)
-
-
-@functools.lru_cache(maxsize=32)
-def _kept(times: tuple[float, ...], segments: int, spacing: float) -> Array:
-    return _rows(np.array(times), segments, spacing, 0)
+    """(T, S + 2) matrix from velocity knots to the way gone at times (T,) [s] within the motion."""
+    return _rows(np.asarray(times, float), segments, spacing, 0)
 
 
 def _rows(times: Array, segments: int, spacing: float, order: int) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pred_core.metrics.chamfer_batch import chamfer_two_sided_batch
@@ -19,7 +20,7 @@ class GoalCost:
 
     name = "goal"
 
-    def __init__(self, goal: Array, particles: Array | None, way: float, end: float):
+    def __init__(self, goal: Array, particles: NDArray[np.int64] | None, way: float, end: float):
         """goal (Q, 3) [m] world; particles: indices of those that a camera could see, None: all; weights [1/m]."""
         self._goal = torch.as_tensor(goal, dtype=torch.float32)[None]
         self._particles = None if particles is None else torch.as_tensor(np.asarray(particles), dtype=torch.long)

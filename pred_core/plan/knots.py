@@ -40,52 +40,59 @@ class KnotLimits:
         self.low = np.array([config.x_low, config.y_low, config.z_low])
         self.high = np.array([config.x_high, config.y_high, config.z_high])
         if not (self.low < self.high).all():
-            raise ConfigError("the planner's workspace box is empty",
-                              got=f"{self.low.tolist()} to {self.high.tolist()} m", allowed="low below high")  # fmt: skip
-        self._ways = (
-            (slice(0, 3), *self._bounds(config.speed, config.acceleration)),
-            (slice(3, 4), *self._bounds(config.turn_speed, config.turn_acceleration)),
-        )
+            got = f"{self.low.tolist()} to {self.high.tolist()} m"
+            raise ConfigError("the planner's workspace box is empty", got=got, allowed="low below high")
+        self._most, self._change = self._bounds(config.speed, config.acceleration)
+        self._most_turn, self._change_turn = self._bounds(config.turn_speed, config.turn_acceleration)
+        # Whether the change can be too large for knots within their speeds; always where the beginning is fixed.
+        both = ((self._most, self._change), (self._most_turn, self._change_turn))
+        self._bound = [i == 0 or any(c[i] < m[i - 1] + m[i] for m, c in both) for i in range(self.free)]
 
     @property
     def free(self) -> int:
         """Number of knots M a sample chooses."""
         return self.segments - 2
 
-    def _bounds(self, fast: float, acceleration: float) -> tuple[Array, Array]:
-        """(M,) largest norm of each free knot, and of its change; the brake at the end takes half the acceleration."""
+    def _bounds(self, fast: float, acceleration: float) -> tuple[list[float], list[float]]:
+        """Largest norm of each of M free knots, and of its change; the brake at the end takes half the acceleration."""
         brake = 0.5 * acceleration * self.spacing
-        most = np.minimum(fast, brake * np.arange(self.free, 0, -1))
-        return most, np.where(most < fast, brake, 2.0 * brake)
+        most = [min(fast, brake * left) for left in range(self.free, 0, -1)]
+        return most, [brake if m < fast else 2.0 * brake for m in most]
 
     def apply(self, samples: Array, first: Array, start: Array) -> Array:
         """All knots (S + 2, K, G, 4) of samples (M, K, G, 4).
 
         first: (2, G, 4) the knots the beginning fixes; start: (G, 3) [m] where it is.
         """
-        count, grippers = samples.shape[1], samples.shape[2]
-        knots = np.zeros((self.segments + 2, count, grippers, samples.shape[3]))
-        knots[:2] = first[:, None]
-        knots[2:-2] = samples
+        count, grippers = samples.shape[1:3]
         h = self.spacing
+        # Axes come first inside, so that every operation runs over one row of all samples.
+        knots = np.zeros((self.segments + 2, 4, count, grippers))
+        knots[:2] = first.transpose(0, 2, 1)[:, :, None]
+        knots[2:-2] = samples.transpose(0, 3, 1, 2)
         # The positions c around which the curve runs (curve.py); c_1 is fixed by the beginning.
-        place = np.broadcast_to(
-            start + h * (first[1, :, :3] - (first[1, :, :3] - first[0, :, :3]) / 6.0), (count, grippers, 3)
-        )
-        low, high = np.minimum(self.low, place), np.maximum(self.high, place)
+        begin = start + h * (first[1, :, :3] - (first[1, :, :3] - first[0, :, :3]) / 6.0)
+        low = np.minimum(self.low, begin).T[:, None]
+        high = np.maximum(self.high, begin).T[:, None]
+        place = np.broadcast_to(begin.T[:, None], (3, count, grippers))
         for i in range(self.free):
             now, before = knots[i + 2], knots[i + 1]
-            for axes, most, change in self._ways:
-                part = now[..., axes]
-                step = _within(part - before[..., axes], change[i])
-                part[...] = _within(before[..., axes] + step, most[i])
-            after = np.clip(place + h * now[..., :3], low, high)
-            now[..., :3] = (after - place) / h
+            if self._bound[i]:
+                now -= before
+                _shorten(now, self._change[i], self._change_turn[i])
+                now += before
+            _shorten(now, self._most[i], self._most_turn[i])
+            after = place + h * now[:3]
+            np.minimum(np.maximum(after, low, out=after), high, out=after)
+            np.multiply(after - place, 1.0 / h, out=now[:3])
             place = after
-        return knots
+        return np.ascontiguousarray(knots.transpose(0, 2, 3, 1))
 
 
-def _within(vectors: Array, length: float) -> Array:
-    """Vectors (..., A) shortened to at most `length`."""
-    square = np.einsum("...i,...i->...", vectors, vectors)[..., None]
-    return vectors * np.minimum(1.0, length / np.sqrt(np.maximum(square, 1e-30)))
+def _shorten(rows: Array, length: float, turn: float) -> None:
+    """Shorten velocities, rows x, y, z, yaw of (4, ...), to at most `length` and `turn`, in place."""
+    square = rows[:3] * rows[:3]
+    square[0] += square[1]
+    square[0] += square[2]
+    rows[:3] *= length / np.sqrt(np.maximum(square[0], length * length))
+    np.minimum(np.maximum(rows[3], -turn, out=rows[3]), turn, out=rows[3])

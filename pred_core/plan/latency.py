@@ -32,7 +32,8 @@ class Observation:
         """Raise InputError unless finite, of `count` particles, and held by a gripper that exists."""
         x, v, held = self.state.position, self.state.velocity, self.state.held
         if x.shape != (count, 3) or v.shape != (count, 3) or held.shape != (count,):
-            raise InputError("the state does not fit the twin", got=f"position {tuple(x.shape)}", allowed=f"({count}, 3)")
+            got = f"position {tuple(x.shape)}"
+            raise InputError("the state does not fit the twin", got=got, allowed=f"({count}, 3)")
         bad = ~torch.isfinite(x + v).all(-1)
         if bool(bad.any()):
             raise InputError(
@@ -72,7 +73,8 @@ def departure(dynamics: Dynamics, seen: Observation, begin: int, in_force: Plan 
     period = round(dynamics.period * NS)
     steps = max(0, round((begin - seen.stamp) / period))
     closed = seen.closed()
-    measured = Beginning(seen.position, seen.rotation, np.zeros((len(seen.position), 4)), np.zeros((len(seen.position), 4)))
+    nothing = np.zeros((len(seen.position), 4))
+    measured = Beginning(seen.position, seen.rotation, nothing, nothing)
     state = dynamics.start(seen.state, _grip(seen.position, seen.rotation, closed))
     offset = np.zeros_like(seen.position) if in_force is None else seen.position - in_force.at(seen.stamp).position
     for k in range(1, steps + 1):

@@ -34,7 +34,7 @@ class Run:
 def carry_out(
     planner: Planner, world: Dynamics, seen: Observation, replans: int, step: float, report: Report
 ) -> Run:
-    """Plan, let `world` follow the plan for `step` [s], observe it, plan again, `replans` times; then follow to the end.
+    """Plan, let `world` follow the plan for `step` [s], observe it, plan again; follow the last plan to its end.
 
     `world` may be another Dynamics than the planner's: what the planner believes is then wrong, as in a real world.
     Raises: InputError if the objective has no goal, or the step is longer than what a plan sends.

@@ -13,7 +13,7 @@ from pred_core.plan.knots import Beginning
 from pred_core.types import Array
 
 NS = 1e9
-CHECK_STEP = 0.01  # [s] between the moments a plan is checked at
+CHECK_STEP = 0.02  # [s] between the moments a plan is checked at
 TOLERANCE = 1.02  # times a limit; interpolation and rounding
 
 

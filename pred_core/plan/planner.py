@@ -61,7 +61,12 @@ class Planner:
         self._last = None
 
     def plan(
-        self, seen: Observation, begin: int | None = None, *, in_force: Plan | None = None, deadline: float | None = None
+        self,
+        seen: Observation,
+        begin: int | None = None,
+        *,
+        in_force: Plan | None = None,
+        deadline: float | None = None,
     ) -> Plan:
         """The best motion that begins at `begin` [ns] (default: at the observation), found before `deadline`.
 

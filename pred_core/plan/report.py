@@ -65,15 +65,18 @@ def write_report(
     first, end = 1e3 * run.distance[0], 1e3 * run.distance[-1]
     page.text(
         f"Two-sided chamfer distance to the goal: {first:.1f} mm at the start, {end:.1f} mm at the end, after "
-        f"{len(run.plans)} plans and {run.period * (len(run.distance) - 1):.1f} s of motion in the twin's own simulation."
+        f"{len(run.plans)} plans and {run.period * (len(run.distance) - 1):.1f} s of motion in the twin's simulation."
     )
     page.code(str(extra.get("command", "")))
     page.figure(_views(run, goal, scene, line), "Start (grey), end (blue), goal (green), the grippers' way (orange).")
     page.html(animation([Track("planned", run.position, NOW), Track("goal", _still(run, goal), GOAL)], run.period,
                         line=line, title="the plan carried out by the twin"))  # fmt: skip
     page.heading("How it was found")
-    page.figure(_curves(run), "Left: distance to the goal while the plans are carried out. Right: the best cost of each "
-                "plan against the time it had; a plan can only get better with time.")  # fmt: skip
+    page.figure(
+        _curves(run),
+        "Left: distance to the goal while the plans are carried out. Right: the best cost of each plan against the "
+        "time it had; a plan can only get better with time.",
+    )
     last = run.plans[-1]
     rows = [(name, number(value)) for name, value in last.parts.items()]
     page.table(("cost of the last plan", "value"), [*rows, ("sum", number(last.cost)),

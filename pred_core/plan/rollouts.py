@@ -21,19 +21,23 @@ class Rollouts:
 
     period: float  # [s] between steps; step t ends at (t + 1) period after the plan's begin
     position: Tensor  # (T, K, N, 3) [m] world, the object
-    grip: Grip  # leading axes (T, K)
+    grip: Grip  # leading axes (T, K), on CPU
     knots: Array  # (S + 2, K, G, 4) velocity knots of the motions (curve.py)
     spacing: float  # [s] of the knots
     frames: tuple[int, ...]  # the steps that costly costs look at, the last one included
 
     def select(self, worlds: Tensor) -> Rollouts:
         """The motions of an index (K',)."""
-        grip = Grip(self.grip.position[:, worlds], self.grip.rotation[:, worlds], self.grip.closed[:, worlds])
-        return Rollouts(self.period, self.position[:, worlds], grip, self.knots[:, worlds.cpu().numpy()], self.spacing,
-                        self.frames)  # fmt: skip
+        chosen = worlds.cpu()
+        grip = Grip(self.grip.position[:, chosen], self.grip.rotation[:, chosen], self.grip.closed[:, chosen])
+        knots = self.knots[:, chosen.numpy()]
+        return Rollouts(self.period, self.position[:, worlds], grip, knots, self.spacing, self.frames)
 
     def finite(self) -> Tensor:
         """(K,) bool: simulated to the end."""
+        low, high = torch.aminmax(self.position)
+        if float(low) >= -FARTHEST and float(high) <= FARTHEST:  # false for NaN; the usual case, in one pass
+            return torch.ones(self.position.shape[1], dtype=torch.bool, device=self.position.device)
         return (self.position.abs() <= FARTHEST).flatten(2).all(-1).all(0)
 
 
@@ -44,15 +48,17 @@ class Simulation:
         """horizon [s] of `segments` knots; frames: how many steps costly costs look at."""
         self._dynamics = dynamics
         steps = max(1, round(horizon / dynamics.period))
-        self._segments, self._spacing = segments, horizon / segments
-        self._times = np.minimum(dynamics.period * np.arange(1, steps + 1), horizon)
+        self._spacing = horizon / segments
+        times = np.minimum(dynamics.period * np.arange(1, steps + 1), horizon)
+        self._weights = displacement_weights(times, segments, self._spacing).astype(np.float32)
+        self._worlds: tuple[State, State] | None = None  # the last state, and its copies
         looked_at = np.ceil(steps * np.arange(1, frames + 1) / frames).astype(int) - 1
         self._frames = tuple(sorted(set(np.maximum(looked_at, 0).tolist())))
 
     @property
     def steps(self) -> int:
         """Periods of a rollout T."""
-        return len(self._times)
+        return len(self._weights)
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -61,17 +67,15 @@ class Simulation:
 
     def run(self, state: State, beginning: Beginning, closed: Tensor, knots: Array) -> Rollouts:
         """Roll out knots (S + 2, K, G, 4) from a started state of one world. `closed` (G,) stays as it is."""
-        weights = displacement_weights(self._times, self._segments, self._spacing)
         count = knots.shape[1]
-        gone = (weights @ knots.reshape(len(knots), -1)).reshape(len(weights), *knots.shape[1:])  # (T, K, G, 4)
-        position = beginning.position + gone[..., :3]
-        rotation = turned(beginning.rotation, gone[..., 3])
-        grip = Grip(
-            torch.as_tensor(position, dtype=torch.float32),
-            torch.as_tensor(rotation, dtype=torch.float32),
-            closed.expand(len(weights), count, -1),
-        )
-        trajectory = rollout_with_nan(self._dynamics, repeated(state, count), grip)
+        # float32, as every Dynamics computes.
+        gone = (self._weights @ knots.astype(np.float32).reshape(len(knots), -1)).reshape(-1, *knots.shape[1:])
+        position = beginning.position.astype(np.float32) + gone[..., :3]
+        rotation = turned(beginning.rotation.astype(np.float32), gone[..., 3])
+        grip = Grip(torch.from_numpy(position), torch.from_numpy(rotation), closed.expand(len(gone), count, -1))
+        if self._worlds is None or self._worlds[0] is not state or self._worlds[1].position.shape[0] != count:
+            self._worlds = (state, repeated(state, count))
+        trajectory = rollout_with_nan(self._dynamics, self._worlds[1], grip)
         return Rollouts(self._dynamics.period, trajectory, grip, knots, self._spacing, self._frames)
 
 

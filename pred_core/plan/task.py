@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
-from pred_core.config import load_yaml, from_mapping
+from pred_core.config import load_config
 from pred_core.dynamics import Dynamics
 from pred_core.errors import ConfigError
 from pred_core.plan.collision_cost import CollisionCost
@@ -56,7 +57,7 @@ def make_objective(body: Body, scene: Scene, goal: Array, config: PlannerConfig)
     c, m = config.costs, config.motion
     low, high = np.array([m.x_low, m.y_low, m.z_low]), np.array([m.x_high, m.y_high, m.z_high])
     points = check_goal(goal, body, scene, low, high)
-    seen = None if bool(body.surface.all()) else np.flatnonzero(body.surface)
+    seen = None if bool(body.surface.all()) else np.flatnonzero(body.surface).astype(np.int64)
     costs: list[Cost] = []
     if c.goal > 0.0 or c.goal_end > 0.0:
         costs.append(GoalCost(points, seen, c.goal, c.goal_end))
@@ -95,4 +96,4 @@ def make_planner(
 
 def load_settings(path: str) -> PlannerConfig:
     """The settings of a YAML file; '' = the defaults. Raises: ConfigError."""
-    return PlannerConfig() if not path else from_mapping(PlannerConfig, load_yaml(path) or {}, path)
+    return PlannerConfig() if not path else load_config(PlannerConfig, Path(path))
