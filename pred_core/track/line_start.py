@@ -11,9 +11,13 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from pred_core.config import setting
+from pred_core.track.color_model import of_same_hue
 from pred_core.types import Array
 
-MAX_VOXELS = 6000  # more is not a line object but a mask that lets everything through
+MAX_VOXELS = 20000  # more is not a line object but a mask that lets everything through
+CHROMA = 0.08  # difference in share of red, green or blue that parts two things that touch
+MOST_OF_IT = 0.99
+THIN = 90  # percent of a line's points that are near to its middle
 
 
 @dataclass(frozen=True)
@@ -35,12 +39,33 @@ class FoundLine:
     length: float  # [m]
 
 
-def find_line(points: Array, config: LineStartConfig) -> FoundLine | None:
-    """The longest slender connected component of points (M, 3) [m] world, or None if there is none."""
-    cells, owner = _voxels(points, config.voxel)
+def find_line(points: Array, color: NDArray[np.uint8], config: LineStartConfig) -> FoundLine | None:
+    """The most slender connected thing of one colour in points (M, 3) [m] world, colours (M, 3); None if there is none.
+
+    What touches the line but has another colour (jaws, fixtures) does not belong to it.
+    """
+    found = _find(points, color, config)
+    if found is None:
+        return None
+    same = of_same_hue(color, color[found.member])
+    if same[found.member].mean() > MOST_OF_IT:
+        return FoundLine(found.path, found.member & same, found.length)
+    # Cells that hold a bit of both had joined them.
+    again = _find(points[same], color[same], config)
+    if again is None:
+        return None
+    member = np.zeros(len(points), bool)
+    member[same] = again.member
+    return FoundLine(again.path, member, again.length)
+
+
+def _find(points: Array, color: NDArray[np.uint8], config: LineStartConfig) -> FoundLine | None:
+    cells, chroma, owner = _voxels(points, color, config.voxel)
     if not 4 <= len(cells) <= MAX_VOXELS:
         return None
     pairs = cKDTree(cells).query_pairs(config.link, output_type="ndarray")
+    apart = np.abs(chroma[pairs[:, 0]] - chroma[pairs[:, 1]]).max(axis=-1, initial=0.0)
+    pairs = pairs[apart < CHROMA]
     if not len(pairs):
         return None
     # The square makes many short steps cheaper than one long: paths follow the line and do not cut its bends.
@@ -48,6 +73,7 @@ def find_line(points: Array, config: LineStartConfig) -> FoundLine | None:
     graph = coo_matrix((length**2, (pairs[:, 0], pairs[:, 1])), shape=(len(cells),) * 2).tocsr()
     _, label = connected_components(graph, directed=False)
     best: FoundLine | None = None
+    most = 0.0
     for component in range(int(label.max()) + 1):
         part = np.flatnonzero(label == component)
         if len(part) * config.voxel < 0.5 * config.shortest:
@@ -56,10 +82,10 @@ def find_line(points: Array, config: LineStartConfig) -> FoundLine | None:
         if path is None:
             continue
         total = float(np.linalg.norm(np.diff(path, axis=0), axis=-1).sum())
-        spread = float(np.median(cKDTree(path).query(cells[part])[0]))
-        slender = total / max(4.0 * spread, config.voxel)
-        if total >= config.shortest and slender >= config.slenderness and (best is None or total > best.length):
-            best = FoundLine(path, np.isin(owner, part), total)
+        spread = float(np.percentile(cKDTree(path).query(cells[part])[0], THIN))
+        slender = total / max(2.0 * spread, config.voxel)
+        if total >= config.shortest and slender >= max(config.slenderness, most):
+            best, most = FoundLine(path, np.isin(owner, part), total), slender
     return best
 
 
@@ -71,19 +97,25 @@ def resample(path: Array, count: int) -> Array:
     return np.stack([np.interp(at, arc, path[:, k]) for k in range(3)], axis=-1)
 
 
-def _voxels(points: Array, size: float) -> tuple[Array, NDArray[np.int64]]:
-    """Mean point of every occupied cell (C, 3), of at least two points where most have more, and each point's cell."""
+def _voxels(points: Array, color: NDArray[np.uint8], size: float) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Mean point and mean share of each primary in every occupied cell (C, 3), and each point's cell.
+
+    Cells of a single point are noise where most have more; their points get cell -1.
+    """
     if not len(points):
-        return np.zeros((0, 3)), np.zeros(0, np.int64)
-    key = np.floor(points / size).astype(np.int64)
-    _, owner, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64)
+    key = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
+    extent = key.max(axis=0) + 1
+    _, owner, count = np.unique(np.ravel_multi_index(key.T, extent), return_inverse=True, return_counts=True)
     owner = owner.ravel()
     mean = np.stack([np.bincount(owner, points[:, k]) for k in range(3)], axis=-1) / count[:, None]
+    tone = np.stack([np.bincount(owner, color[:, k]) for k in range(3)], axis=-1) / count[:, None]
+    chroma = tone / np.maximum(tone.sum(axis=-1, keepdims=True), 1.0)
     if float(np.median(count)) < 4:
-        return mean, owner
+        return mean, chroma, owner
     kept = count >= 2
     place = np.where(kept, np.cumsum(kept) - 1, -1)
-    return mean[kept], place[owner]
+    return mean[kept], chroma[kept], place[owner]
 
 
 def _order(cells: Array, graph: csr_matrix, config: LineStartConfig) -> Array | None:

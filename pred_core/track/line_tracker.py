@@ -12,7 +12,7 @@ from pred_core.config import setting
 from pred_core.track.estimate import Estimate, Prior, Status, trace_confidence
 from pred_core.track.grasp import Grasp, GraspConfig
 from pred_core.track.line_fit import SURFACE, Anchors, Cloud, LineFit, LineFitConfig, fit_line
-from pred_core.track.line_start import LineStartConfig, find_line, resample
+from pred_core.track.line_start import FoundLine, LineStartConfig, find_line, resample
 from pred_core.track.view import View
 from pred_core.types import Array, Tracks
 
@@ -33,6 +33,7 @@ class LineConfig:
     points: int = setting(600, low=50, high=20000, doc="most points used of one camera")
     acceleration: float = setting(10.0, unit="m/s^2", low=0.1, high=1000.0, doc="that the motion prior allows for")
     bridge: float = setting(0.08, unit="m", low=0.0, high=0.5, doc="longest end hidden in a gripper's jaws")
+    end_in_tool: bool = setting(True, doc="a held end is in the tool centre; false: where it is seen")
     seen: float = setting(1.5, low=0.1, high=100.0, doc="points of one camera at a particle that make it visible")
     doubt: float = setting(0.96, low=0.0, high=1.0, doc="points explained less nodes contradicted; below, look anew")
     lost: float = setting(0.5, low=0.0, high=1.0, doc="share of the points on the line below which it is lost")
@@ -64,7 +65,7 @@ class LineTracker:
 
     def start(self, views: Sequence[View], stamp: int, poses: Poses | None, closed: NDArray[np.bool_]) -> list[View]:
         """Look for the line. Returns the part of each view that is on it; nothing if it is not found."""
-        found = find_line(np.concatenate([v.points for v in views]), self.config.start)
+        found = _find(views, self.config.start)
         if found is None:
             return []
         path = self._oriented(found.path, poses, closed)
@@ -74,7 +75,8 @@ class LineTracker:
         nodes = resample(path, self.config.particles)
         radius = self.config.radius or _radius(members, nodes)
         cloud = self._cloud(members, stamp, radius)
-        nodes, length = _settle(nodes, cloud, radius, self.config, self.length if known else None)
+        ends = self._ends_in_tools(nodes, poses, closed)
+        nodes, length = _settle(nodes, cloud, radius, self.config, self.length if known else None, ends)
         if known and abs(length - self.length) > self.config.tolerance * self.length:
             return []
         self.length = self.length if known else length
@@ -112,11 +114,21 @@ class LineTracker:
         self.stamp = stamp
         return self._estimate(fit, visible, self._judge(fit, views, stamp), tuple(v.camera for v in views))
 
+    def _ends_in_tools(self, nodes: Array, poses: Poses | None, closed: NDArray[np.bool_]) -> Anchors:
+        """A held end is in the tool centre, which the jaws hide."""
+        target, information = nodes.copy(), np.zeros((len(nodes), 3, 3))
+        grips = np.zeros((0, 3)) if poses is None else poses[0][: len(closed)][closed[: len(poses[0])]]
+        for gripper in grips if self.config.end_in_tool else ():
+            end = min((0, -1), key=lambda e: float(np.linalg.norm(nodes[e] - gripper)))  # noqa: B023 (used at once)
+            if np.linalg.norm(nodes[end] - gripper) < self.config.grasp.radius:
+                target[end], information[end] = gripper, np.eye(3) / self.config.grasp.sigma**2
+        return Anchors(target, information)
+
     def _second_opinion(
         self, fit: LineFit, score: float, views: Sequence[View], stamp: int, poses: Poses | None
     ) -> LineFit:
         """A fit from scratch, if it explains the pictures better than the one that followed the motion."""
-        found = find_line(np.concatenate([v.points for v in views]), self.config.start)
+        found = _find(views, self.config.start)
         if found is None or abs(found.length - self.length) > self.config.tolerance * self.length:
             return fit
         nodes = resample(self._oriented(found.path, poses, self._closed), self.config.particles)
@@ -198,6 +210,10 @@ class LineTracker:
         return path
 
 
+def _find(views: Sequence[View], config: LineStartConfig) -> FoundLine | None:
+    return find_line(np.concatenate([v.points for v in views]), np.concatenate([v.color for v in views]), config)
+
+
 def _contradicted(views: Sequence[View], fit: LineFit) -> float:
     """Share of the nodes where no camera sees the line although nothing stands before it."""
     found = np.zeros(len(fit.nodes), bool)
@@ -215,13 +231,15 @@ def _near(view: View, nodes: Array, reach: float) -> View:
     return view if keep.all() else view.select(keep)
 
 
-def _settle(nodes: Array, cloud: Cloud, radius: float, config: LineConfig, length: float | None) -> tuple[Array, float]:
+def _settle(
+    nodes: Array, cloud: Cloud, radius: float, config: LineConfig, length: float | None, ends: Anchors
+) -> tuple[Array, float]:
     """Fit from a rough path; without a given length the line takes the one its points have."""
     total = length
     for _ in range(8):
         edge = np.linalg.norm(np.diff(nodes, axis=0), axis=-1)
         spacing = (float(edge.sum()) if total is None else total) / (len(nodes) - 1)
-        fit = fit_line(nodes, spacing, cloud, radius, config.fit, iterations=3)
+        fit = fit_line(nodes, spacing, cloud, radius, config.fit, ends, iterations=3)
         nodes = fit.nodes if total is not None else resample(fit.nodes, len(nodes))
     return nodes, float(np.linalg.norm(np.diff(nodes, axis=0), axis=-1).sum())
 

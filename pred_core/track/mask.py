@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pred_core.track.color_model import ColorModel, Picture
+from pred_core.track.color_model import ColorModel, Picture, of_same_hue
 from pred_core.track.view import Lifter, View
 from pred_core.track.workspace import Shape, Workspace, inside_any
 from pred_core.types import CameraFrame
@@ -42,7 +42,9 @@ class ObjectMask:
             flat = frame.rgb.reshape(-1, 3)
             mine.append(flat[pixel])
             rest = np.ones(len(flat), bool)
-            rest[_grown(pixel, frame.depth.shape)] = False
+            if len(pixel):
+                rim = _grown(pixel, frame.depth.shape)
+                rest[rim[of_same_hue(flat[rim], flat[pixel])]] = False
             sample = np.arange(0, len(flat), STRIDE)
             others.append(flat[sample[rest[sample]]])
         empty: Picture = np.zeros((0, 3), np.uint8)
@@ -60,4 +62,4 @@ def _grown(pixel: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int64
         for dv in range(-4, 5, 2)
         for du in range(-4, 5, 2)
     ]
-    return np.unique(np.concatenate(found)) if len(pixel) else pixel
+    return np.unique(np.concatenate(found))

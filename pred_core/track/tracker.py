@@ -101,8 +101,10 @@ class Tracker:
         oldest = stamp - self.config.window * 1e9
         self._views = {c: v for c, v in self._views.items() if v.stamp >= oldest}
         views = [self._views[c] for c in self.cameras if c in self._views]
-        if self._searching and not self._find(views, frames, stamp, poses):
-            return None
+        if self._searching:
+            if not self._find(views, frames, stamp, poses):
+                return None
+            views = [self._views[v.camera] for v in views]
         prior = self._prior if self._prior is not None and abs(stamp - self._prior.stamp) * 1e-9 < 0.5 else None
         estimate = self._line.update(views, stamp, poses, prior)
         if estimate.status == "lost":
@@ -126,6 +128,7 @@ class Tracker:
         if self.mask.color is None:
             pairs = [(frames[m.camera], m.pixel) for m in members if m.camera in frames]
             self.mask.learn([f for f, _ in pairs], [p for _, p in pairs])
+            self._views.update({c: self.mask.view(c, f) for c, f in frames.items()})
         self._searching = False
         return True
 
