@@ -48,6 +48,6 @@ def clock_notes(episodes: Sequence[Episode]) -> list[str]:
         worst, name = max(lost)
         notes.append(f"clock: {len(lost)} episodes lost frames, {name} {worst:.0%} of them")
     periods = np.array([e.period for e in episodes])
-    if np.ptp(periods) > 0.02 * np.median(periods):
+    if np.ptp(periods) > 0.1 * np.median(periods):
         notes.append(f"clock: frames come every {1e3 * periods.min():.2f} to {1e3 * periods.max():.2f} ms")
     return notes

@@ -16,7 +16,7 @@ MOVED = 0.03  # [m] while its gripper moves that far
 STILL = 4.0  # deviations of the noise, at least STILL_LEAST, within which it stays
 STILL_LEAST = 1.5e-3  # [m]
 TOGETHER = 3  # particles that rest at once: a hanging end that lags is alone
-FLAT = 3e-3  # [m] spread of the heights of what rests on one plane, beyond noise; more is no table
+FLAT = 5e-4  # [m] spread of the heights of what rests on a plane, or the noise if that is larger; more is no plane
 FEWEST = 3  # episodes
 
 
@@ -61,7 +61,7 @@ def fit_plane(episodes: Sequence[Episode], sigma: float, middle: Array | None = 
     everything = np.concatenate(points)
     where = everything[:, :2].mean(axis=0) if middle is None else middle
     value, residual = _plane(everything, where)
-    if 1.4826 * float(np.median(np.abs(residual))) > FLAT + sigma:
+    if 1.4826 * float(np.median(np.abs(residual))) > max(FLAT, sigma):
         return None
     parts = [_plane(np.concatenate(points[:k] + points[k + 1 :]), where)[0] for k in range(len(points))]
     off = np.array(parts) - np.mean(parts, axis=0)
