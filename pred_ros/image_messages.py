@@ -13,12 +13,22 @@ from pred_ros import convert
 
 def frame_to_color(camera: str, frame: CameraFrame) -> Image:
     """camN/color/image_raw in rgb8."""
-    return _image(camera, frame.stamp, "rgb8", np.ascontiguousarray(frame.rgb))
+    return color_to_message(camera, frame.stamp, frame.rgb)
 
 
 def frame_to_depth(camera: str, frame: CameraFrame) -> Image:
     """camN/depth/image_raw in 16UC1 millimetres, 0 = none (REP-118): what depth cameras send."""
-    return _image(camera, frame.stamp, "16UC1", images.millimetres(frame.depth))
+    return depth_to_message(camera, frame.stamp, frame.depth)
+
+
+def color_to_message(camera: str, stamp: int, rgb: images.Color) -> Image:
+    """A picture (H, W, 3) as rgb8."""
+    return _image(camera, stamp, "rgb8", np.ascontiguousarray(rgb))
+
+
+def depth_to_message(camera: str, stamp: int, depth: images.Depth) -> Image:
+    """Depth (H, W) [m] as 16UC1."""
+    return _image(camera, stamp, "16UC1", images.millimetres(depth))
 
 
 def frame_to_info(camera: str, frame: CameraFrame) -> CameraInfo:

@@ -1,6 +1,7 @@
 """The player: replays the bags of a data set (or one bag) as the topics of the wire, and loses nothing.
 
-Out: tracker/points, gripper/pose, gripper/closed (latched too), player/episode (marks.py), /clock if asked.
+Out: tracker/points, gripper/pose, gripper/closed (latched too), pictures of cameras, unpacked if they are compressed
+(a slow reader loses some), player/episode (marks.py), /clock if asked.
 `~/pause` (SetBool). At the end of the data it waits until every reader has everything, then exits 0.
 """
 
@@ -29,6 +30,7 @@ from pred_core.errors import ConfigError, InputError, PredError
 from pred_core.live import marks
 from pred_ros import convert, qos, shell
 from pred_ros.diagnostics import OK, WARN
+from pred_ros.played_pictures import PlayedPictures
 from pred_ros.playlist import Clip, Timed, find_clips, stream
 from pred_ros.shell import Shell
 
@@ -56,6 +58,7 @@ class PlayerConfig:
     wait_for: int = setting(1, low=0, high=64, doc="readers of tracker/points and gripper/pose to wait for")
     patience: float = setting(30.0, unit="s", low=0.1, high=3600.0, doc="longest wait for readers")
     clock: bool = setting(False, doc="publish /clock")
+    points: bool = setting(True, doc="play tracker/points; false: leave that to a tracker that sees the pictures")
     autostart: bool = setting(True, doc="configure and activate without a lifecycle manager")
 
 
@@ -96,13 +99,15 @@ class PlayerNode(Shell):
             raise ConfigError(
                 "stamps 'now' keeps the time between frames", got=f"factor {config.factor:g}", allowed="factor 1"
             )
-        self._clips = find_clips(Path(config.bag), config.split, tuple(n for n in config.episodes.split(",") if n))
+        names = tuple(n for n in config.episodes.split(",") if n)
+        self._clips = find_clips(Path(config.bag), config.split, names, config.points)
         complete = qos.points_complete()
         self._out: dict[str, Publisher] = {
             TRACKER_POINTS: self.create_publisher(PointCloud2, TRACKER_POINTS, complete),
             GRIPPER_POSE: self.create_publisher(PoseArray, GRIPPER_POSE, complete),
             GRIPPER_CLOSED: self.create_publisher(UInt8MultiArray, GRIPPER_CLOSED, qos.latched(qos.COMPLETE_DEPTH)),
         }
+        self._pictures = PlayedPictures(self, sorted({t for c in self._clips for t in c.cameras}))
         self._marks_out = self.create_publisher(String, marks.TOPIC, qos.latched(1000))
         self._clock_out = self.create_publisher(Clock, "/clock", 10) if config.clock else None
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -177,11 +182,12 @@ class PlayerNode(Shell):
 
     def _wait_for_readers(self) -> None:
         deadline = time.monotonic() + self.config.patience
-        watched = (TRACKER_POINTS, GRIPPER_POSE)
+        points, color = any(TRACKER_POINTS in c.topics for c in self._clips), self._pictures.color
+        leading = self._out[TRACKER_POINTS] if points or color is None else color
         while not self._halt.is_set():
-            found = {t: self._out[t].get_subscription_count() for t in watched}
+            found = {p.topic: p.get_subscription_count() for p in (leading, self._out[GRIPPER_POSE])}
             # The evaluator reads no poses: the poses need one reader, the points all of them.
-            if found[TRACKER_POINTS] >= self.config.wait_for and found[GRIPPER_POSE] >= min(1, self.config.wait_for):
+            if found[leading.topic] >= self.config.wait_for and min(found.values()) >= min(1, self.config.wait_for):
                 return
             if time.monotonic() > deadline:
                 raise InputError(
@@ -243,6 +249,10 @@ class PlayerNode(Shell):
         return due, elapsed
 
     def _publish(self, message: Timed, shift: int) -> None:
+        if message.topic not in self._out:
+            if self._pictures.play(message.topic, message.data, message.stamp + shift):
+                self.diagnostics.count("pictures and calibrations")
+            return
         decoded: Any = deserialize_message(message.data, _CLASSES[message.topic])
         if message.topic != GRIPPER_CLOSED:
             decoded.header.stamp = convert.time_at(message.stamp + shift)

@@ -7,6 +7,7 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,9 +29,10 @@ from pred_core.arm import plant as plant_arm
 from pred_core.arm.protocol import SetPoint
 from pred_core.bag import images
 from pred_core.bag.clouds import read_tracker_points
-from pred_core.bag.grippers import PoseFrame
+from pred_core.bag.grippers import PoseFrame, make_gripper_closed, make_gripper_pose
 from pred_core.bag.wire import stamp_of
-from pred_core.errors import InputError
+from pred_core.bag.writer import BagWriter
+from pred_core.errors import BagError, InputError
 from pred_core.plant.live import controller
 from pred_core.plant.live.cell import Cell, CellConfig
 from pred_core.plant.live.controller import Controller
@@ -39,6 +41,10 @@ from pred_ros import convert, qos
 from pred_ros.diagnostics import ERROR, WARN
 from pred_ros.paced_worker import PacedWorker
 from pred_ros.plant_node import PlantNode
+from pred_ros.player_node import PlayerNode
+from pred_ros.playlist import find_clips
+
+CAMERA_SAMPLE = Path(__file__).parents[1] / "bags" / "sample_cameras.mcap"
 
 ROOM = {"x_low": 0.2, "x_high": 0.7, "clearance": 0.015, "rate": 50.0}
 FAST = {"cameras": "0", "mover": "free"}
@@ -265,4 +271,39 @@ def test_the_arm_node_follows_commands_with_it_and_stops_at_its_fault() -> None:
 
 def test_nobody_at_the_port_is_said() -> None:
     with pytest.raises(InputError, match="nobody at 127.0.0.1:9.*Start the plant node"):
-        plant_arm.connect_plant(port=9)
+        plant_arm.connect_plant(port=9, patience=0.2)
+
+
+def test_the_sample_bag_plays_as_live_cameras() -> None:
+    color: list[Image] = []
+    depth: list[Image] = []
+    poses: dict[str, list[PoseStamped]] = {f"cam{k}": [] for k in range(4)}
+    with bench_of(PlayerNode, {"bag": str(CAMERA_SAMPLE), "factor": "4.0", "wait_for": "1"}, feeds=False) as bench:
+        hear = bench.world.create_subscription
+        hear(Image, "cam2/color/image_raw", color.append, qos.images())
+        hear(Image, "cam2/depth/image_raw", depth.append, qos.images())
+        hear(Image, "cam0/color/image_raw", lambda _: None, qos.images())
+        hear(PoseArray, "gripper/pose", lambda _: None, qos.points_complete())
+        for name, heard in poses.items():
+            hear(PoseStamped, f"{name}/pose", heard.append, qos.latched())
+        bench.until(lambda: bench.node.exit_code == 0, "the end of the bag")
+        bench.until(lambda: len(color) == 15 and len(depth) == 15, "2.8 s at 5 Hz are 15 pictures")
+    assert all(poses.values())
+    picture, metres = images.read_color(color[-1], "c"), images.read_depth(depth[-1], "d")
+    assert picture.shape == (240, 320, 3) and color[-1].encoding == "rgb8" and depth[-1].encoding == "16UC1"
+    assert np.nanmedian(metres) == pytest.approx(0.7, abs=0.2), "the cameras stand 0.7 m away"
+    # The rope is orange, (0.85, 0.36, 0.08): red at least 1.6 times green, hundreds of pixels.
+    red, green = picture[..., 0].astype(int), picture[..., 1].astype(int)
+    assert np.count_nonzero((red > 90) & (red > 1.6 * green)) > 300
+
+
+def test_a_bag_without_anything_to_play_is_refused(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "poses.mcap") as writer:
+        for k in range(3):
+            stamp = (k + 1) * 10**9
+            writer.write("gripper/pose", make_gripper_pose(stamp, np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])), stamp)
+            writer.write("gripper/closed", make_gripper_closed(np.array([True])), stamp)
+    with pytest.raises(BagError, match="no topic 'tracker/points'"):
+        find_clips(tmp_path / "poses.mcap")
+    with pytest.raises(BagError, match="nothing to play"):
+        find_clips(tmp_path / "poses.mcap", points=False)

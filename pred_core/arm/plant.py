@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +14,8 @@ from pred_core.arm.protocol import Reading, SetPoint
 from pred_core.errors import InputError
 
 HOST, PORT = "127.0.0.1", 7654
-PATIENCE = 2.0  # [s] to connect, and for a reply
+PATIENCE = 2.0  # [s] for a reply
+STARTING = 30.0  # [s] to connect: a plant that is started together with the arm is not there yet
 START_IT = "Start the plant node, and give both the same port"
 
 
@@ -72,11 +74,16 @@ class PlantArm:
         return dict(reply)
 
 
-def connect_plant(host: str = HOST, port: int = PORT) -> PlantArm:
-    """Connect to a plant node. Raises: InputError if nobody answers."""
-    try:
-        connection = socket.create_connection((host, port), timeout=PATIENCE)
-    except OSError as error:
-        raise InputError(f"plant: nobody at {host}:{port}", got=error, next_step=START_IT) from error
+def connect_plant(host: str = HOST, port: int = PORT, patience: float = STARTING) -> PlantArm:
+    """Connect to a plant node within `patience` [s]. Raises: InputError if nobody answers."""
+    end = time.monotonic() + patience
+    while True:
+        try:
+            connection = socket.create_connection((host, port), timeout=PATIENCE)
+            break
+        except OSError as error:
+            if time.monotonic() > end:
+                raise InputError(f"plant: nobody at {host}:{port}", got=error, next_step=START_IT) from error
+            time.sleep(0.1)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return PlantArm(connection)

@@ -51,7 +51,7 @@ def read_depth(message: Any, where: str) -> Depth:
         return np.where(depth > 0.0, depth, np.float32(np.nan))
     if message.encoding == "16UC1":
         bits = _rows(message, 2, where).copy().view(">u2" if message.is_bigendian else "<u2")
-        return _metres(bits.reshape(message.height, message.width))
+        return metres(bits.reshape(message.height, message.width))
     raise BagError(f"{where}: encoding", got=repr(message.encoding), allowed="32FC1, 16UC1")
 
 
@@ -103,7 +103,7 @@ def read_depth_compressed(message: Any, where: str) -> Depth:
     picture = cv2.imdecode(np.frombuffer(bytes(message.data)[DEPTH_HEADER:], np.uint8), cv2.IMREAD_UNCHANGED)
     if picture is None or picture.dtype != np.uint16 or picture.ndim != 2:
         raise BagError(f"{where}: not a 16 bit PNG after {DEPTH_HEADER} bytes", got=f"{len(message.data)} bytes")
-    return _metres(picture)
+    return metres(picture)
 
 
 def millimetres(depth: Depth) -> NDArray[np.uint16]:
@@ -183,7 +183,8 @@ def _rows(message: Any, bytes_a_pixel: int, where: str) -> Color:
     return data.reshape(height, step)[:, : width * bytes_a_pixel]
 
 
-def _metres(picture: NDArray[np.uint16]) -> Depth:
+def metres(picture: NDArray[np.uint16]) -> Depth:
+    """(H, W) [m], NaN = none, of 16UC1 millimetres."""
     depth = picture.astype(np.float32) * np.float32(1e-3)
     depth[picture == 0] = np.nan
     return depth

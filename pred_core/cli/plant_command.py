@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 import importlib.util
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pred_core.bag.dataset import Dataset
 from pred_core.cli.convert_command import progress_line
@@ -37,9 +37,27 @@ def configure(parser: argparse.ArgumentParser) -> None:
         world.add_argument("--particles", type=int, default=SessionConfig.particles, help="tracked points")
         world.add_argument("--rate", type=float, help="of the tracks [Hz]; default 30")
         world.add_argument("--noise", type=float, help="of the tracks [m]; default 0.0007")
+    _configure_cell(worlds)
     rope.set_defaults(make=_rope)
     springs.set_defaults(make=_springs)
     worlds.add_parser("effects", help="list the effects that can be hidden").set_defaults(make=_effects)
+
+
+def _configure_cell(worlds: Any) -> None:
+    cell = worlds.add_parser("collect", help="record random motions in the cell through cameras and tracker")
+    cell.add_argument("--out", type=Path, required=True, metavar="DATASET", help="folder to write")
+    cell.add_argument("--episodes", type=int, nargs=3, default=(12, 4, 4), metavar=("TRAIN", "TEST", "SLOT"))
+    cell.add_argument("--seconds", type=float, default=8.0, help="of an episode")
+    cell.add_argument("--rate", type=float, default=15.0, help="of cameras and tracks [Hz]")
+    cell.add_argument("--seed", type=int, default=0, help="starts and motions")
+    cell.add_argument("--cable", type=int, default=0, help="0: the nominal cable; else the seed of a drawn one")
+    cell.add_argument("--gap", type=float, default=0.024, help="of the slot [m]")
+    cell.add_argument("--mover", choices=("arm", "free"), default="arm", help="an arm, or a gripper without one")
+    cell.add_argument("--pictures", action="store_true", help="keep the pictures in the bags, compressed")
+    cell.set_defaults(make=_collect)
+    sample = worlds.add_parser("sample", help="write the small bag of four cameras that ships in bags/")
+    sample.add_argument("--out", type=Path, required=True, metavar="BAG", help="file to write, .mcap")
+    sample.set_defaults(make=_sample)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -63,6 +81,30 @@ def _springs(args: argparse.Namespace) -> int:
 
     session, sensor = _settings(args)
     return _report(write_springs_case(args.out, args.seed, progress_line(), session=session, sensor=sensor))
+
+
+def _collect(args: argparse.Namespace) -> int:
+    from pred_core.cli.plant_collect import TrackerWatcher
+    from pred_core.plant.live.campaign import CampaignConfig, collect
+    from pred_core.plant.live.cell import CellConfig
+
+    train, test, slot = args.episodes
+    campaign = CampaignConfig(train, test, slot, args.seconds, args.rate, args.seed, args.pictures)
+    cell = CellConfig(mover=args.mover, cable=args.cable)
+    check_ranges(campaign, "pred plant collect")
+    check_ranges(cell, "pred plant collect")
+    dataset = collect(args.out, TrackerWatcher, progress_line(), campaign, cell, args.gap)
+    counts = ", ".join(f"{len(dataset.select(s))} {s}" for s in dataset.splits)
+    print(f"{dataset.root}: {len(dataset.entries)} episodes ({counts})")
+    return 0
+
+
+def _sample(args: argparse.Namespace) -> int:
+    from pred_core.plant.live.sample import write_camera_sample
+
+    write_camera_sample(args.out)
+    print(f"{args.out}: {args.out.stat().st_size / 1e6:.2f} MB")
+    return 0
 
 
 def _effects(args: argparse.Namespace) -> int:
