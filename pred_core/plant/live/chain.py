@@ -68,17 +68,19 @@ class Chain:
         """Tool pose and Jacobian (6, 7): rows velocity [m/s], then angular velocity [rad/s], of the tool in world."""
         turned, place = self._base, self._origin
         axes, places = np.empty((COUNT, 3)), np.empty((COUNT, 3))
+        spin = np.zeros((COUNT, 3, 3))  # about each joint's own z axis
+        spin[:, 0, 0] = spin[:, 1, 1] = np.cos(q)
+        spin[:, 1, 0] = np.sin(q)
+        spin[:, 0, 1], spin[:, 2, 2] = -spin[:, 1, 0], 1.0
+        spin = _ROLLED @ spin
         for k in range(COUNT):
             place = place + turned @ OFFSETS[k]
-            turned = turned @ _ROLLED[k]
+            turned = turned @ spin[k]
             axes[k], places[k] = turned[:, 2], place
-            c, s = np.cos(q[k]), np.sin(q[k])
-            turned = np.stack(
-                (c * turned[:, 0] + s * turned[:, 1], c * turned[:, 1] - s * turned[:, 0], turned[:, 2]), axis=1
-            )
         tip = place + TOOL_LENGTH * turned[:, 2]
-        jacobian = np.concatenate([np.cross(axes, tip - places).T, axes.T])
-        return ToolPose(tip, quaternion_of_matrix(turned)), jacobian
+        arm = tip - places
+        linear = axes[:, [1, 2, 0]] * arm[:, [2, 0, 1]] - axes[:, [2, 0, 1]] * arm[:, [1, 2, 0]]  # axis x arm
+        return ToolPose(tip, quaternion_of_matrix(turned)), np.concatenate([linear.T, axes.T])
 
     def inverse(self, target: ToolPose, near: Array, posture_steps: int = 1) -> Array:
         """Joint angles (7,) [rad] that reach `target`, starting from `near`.
