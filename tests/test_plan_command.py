@@ -78,8 +78,8 @@ def test_a_rope_is_brought_to_a_goal_that_can_be_reached(twin: Twin, start: Obse
     assert speed.max() <= QUICK.motion.speed * 1.02  # also across the borders of plans
 
 
-def test_the_fingers_go_around_a_post(twin: Twin, start: Observation, goal: np.ndarray) -> None:
-    """A post of 4 cm stands in the straight way; without the collision cost the fingers hit it."""
+def test_the_hand_goes_around_a_post(twin: Twin, start: Observation, goal: np.ndarray) -> None:
+    """A post of 4 cm stands in the straight way; without the collision cost the hand hits it."""
     middle = start.position[0] + 0.5 * WAY
     slot = Slot(x=float(middle[0]), y=float(middle[1]), yaw=1.03, gap=0.002, width=0.02, thickness=0.02, height=0.3)
     depth = {}
@@ -96,7 +96,7 @@ def test_the_fingers_go_around_a_post(twin: Twin, start: Observation, goal: np.n
         grip = Grip(places, turns, torch.ones(60, 1, 1))
         far = torch.full((60, 1, 16, 3), 5.0)
         rolled = Rollouts(1 / 30, far, grip, plan.curve.knots[:, None], 0.25, (59,))
-        depth[weight] = float(collision.finger_depth(rolled))  # type: ignore[attr-defined]
+        depth[weight] = float(collision.hand_inside(rolled).mean())  # type: ignore[attr-defined]
         assert len(scene.fixtures) == 2
     assert depth[0.0] > 0.002 and depth[20.0] < 0.2 * depth[0.0]
 

@@ -11,7 +11,7 @@ from plan_cases import settings
 
 from pred_core.errors import ConfigError, InputError
 from pred_core.metrics.chamfer import chamfer_one_sided, chamfer_two_sided
-from pred_core.plan.collision_cost import CollisionCost
+from pred_core.plan.collision_cost import CollisionCost, Hand
 from pred_core.plan.config import CostConfig
 from pred_core.plan.costs import Objective
 from pred_core.plan.distance import distance_to
@@ -97,7 +97,7 @@ def test_distance_agrees_with_the_simulators_contact(fixture: Box | Capsule | Sp
 
 
 def collision(scene: Scene, body: Body) -> CollisionCost:
-    return CollisionCost(scene, body, 1.0, margin=0.005, radius=0.01, length=0.1)
+    return CollisionCost(scene, body, Hand(0.01, 0.1, 0.03, 0.1), 1.0, margin=0.005)
 
 
 def test_collision_of_object_fingers_and_table() -> None:
@@ -106,11 +106,17 @@ def test_collision_of_object_fingers_and_table() -> None:
     cost = collision(scene, body)
     # Between particles 0 and 1 the line passes through the middle of the sphere: 20 + 5 + 2 mm deep.
     assert cost.object_depth(rollouts(row(3, 0.1)[None])).item() == pytest.approx(0.027, abs=1e-6)
-    # The fingers stand from z = 0.25 to 0.35 m beside the sphere: 15 mm off its centre is 20 + 10 - 15 mm deep
-    # at the height of a sphere of the capsule; they lie 33.3 mm apart, the nearest 16.7 mm from its centre's height.
-    depth = cost.finger_depth(rollouts(row(3, 0.1)[None] + 5.0, np.array([[0.05, 0.015, 0.25]]))).item()
-    assert depth == pytest.approx(0.03 - np.hypot(0.015, 0.05 - 0.1 / 3), abs=1e-6)
-    under = cost.finger_depth(rollouts(row(3, 0.1)[None] + 5.0, np.array([[0.5, 0.5, -0.004]]))).item()
+    # The fingers stand from z = 0.25 to 0.35 m, spheres 25 mm apart, beside the sphere: 20 + 10 - 15 mm deep.
+    away = row(3, 0.1)[None] + 5.0
+    assert cost.hand_inside(rollouts(away, np.array([[0.05, 0.015, 0.25]]))).item() == pytest.approx(0.015, abs=1e-6)
+    # The palm stands 10 to 20 cm above the tool centre: its lowest sphere, 13 cm above, here at the sphere's height,
+    # 45 mm off is 20 + 30 - 45 mm deep, where the fingers would be free.
+    assert cost.hand_inside(rollouts(away, np.array([[0.05, 0.045, 0.17]]))).item() == pytest.approx(0.005, abs=1e-6)
+    hits = CollisionCost(scene, body, Hand(0.01, 0.1, 0.0, 0.1), 0.0, 0.0, hit=5.0, hand_margin=0.002)
+    # Fingers 31 mm off the centre stay 1 mm clear of the sphere; with a margin of 2 mm they hit it.
+    assert hits(rollouts(away, np.array([[0.05, 0.031, 0.25]]))).item() == pytest.approx(5.0)
+    assert hits(rollouts(away, np.array([[0.05, 0.0321, 0.25]]))).item() == 0.0
+    under = cost.hand_inside(rollouts(row(3, 0.1)[None] + 5.0, np.array([[0.5, 0.5, -0.004]]))).item()
     assert under == pytest.approx(0.004, abs=1e-6)
 
 
@@ -142,7 +148,7 @@ def test_stretch_beyond_what_is_free() -> None:
 
 
 def test_passage_measures_how_far_beside_the_gap_a_line_crosses() -> None:
-    slot = Slot(x=0.1, y=0.0, gap=0.024, height=0.1)
+    slot = Slot(x=0.1, y=0.0, yaw=0.0, gap=0.024, height=0.1)
     body = line_body(row(2, 0.2, (0.0, 0.0, 0.05)), radius=0.004)
     through = row(2, 0.2, (0.0, 0.005, 0.05))
     beside, above, short = (through + d for d in ([0, 0.02, 0], [0, 0, 0.08], [-0.15, 0.3, 0]))
@@ -160,6 +166,18 @@ def test_slot_posts_leave_the_gap_free() -> None:
     assert min(distance_to(p, inside).min().item() for p in slot.posts()) == pytest.approx(0.0001, abs=1e-5)
     middle = torch.tensor(slot.foot + up + (0.012 + 0.045) * slot.axes[1], dtype=torch.float32)
     assert distance_to(slot.posts()[1], middle).item() == pytest.approx(-0.006, abs=1e-6)  # half the thickness
+
+
+def test_the_slot_is_the_stand_in_worlds() -> None:
+    """The same numbers make the same posts there and here; neither may import the other."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    from pred_core.plant.live.slot import SlotConfig
+
+    for values in ({}, {"x": 0.3, "y": -0.1, "yaw": 0.7, "gap": 0.03, "width": 0.1, "thickness": 0.01, "height": 0.12}):
+        here, there = Slot(**values).posts(), SlotConfig(**values).boxes
+        for a, b in zip(sorted(here, key=str), sorted(there, key=str), strict=True):
+            assert a.center == pytest.approx(b.center, abs=1e-12) and a.half_size == pytest.approx(b.half_size)
+            assert a.rotation == pytest.approx(b.rotation)
 
 
 def test_a_diverged_motion_costs_infinity_and_hides_from_the_costs() -> None:

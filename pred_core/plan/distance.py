@@ -22,8 +22,8 @@ def distance_to(fixture: Fixture, points: Tensor) -> Tensor:
     return (points - begin - share[..., None] * way).norm(dim=-1) - fixture.radius
 
 
-def depth_in(fixtures: tuple[Fixture, ...], points: Tensor, keep: float) -> Tensor:
-    """(...) [m] how far points (..., 3) are inside the surfaces `keep` [m] around fixtures; 0 outside all."""
+def depth_in(fixtures: tuple[Fixture, ...], points: Tensor, keep: float | Tensor) -> Tensor:
+    """(...) [m] how far points (..., 3) are inside the surfaces `keep` (...) [m] around fixtures; 0 outside all."""
     deepest = points.new_zeros(points.shape[:-1])
     for fixture in fixtures:
         deepest = torch.maximum(deepest, keep - distance_to(fixture, points))

@@ -18,7 +18,7 @@ class Slot:
     x: float = setting(0.45, unit="m", low=-3.0, high=3.0, doc="middle of the gap in world")
     y: float = setting(0.0, unit="m", low=-3.0, high=3.0, doc="middle of the gap in world")
     z: float = setting(0.0, unit="m", low=-3.0, high=3.0, doc="foot of the posts")
-    yaw: float = setting(0.0, unit="rad", low=-math.pi, high=math.pi, doc="of the direction through the gap from x")
+    yaw: float = setting(math.pi / 2, unit="rad", low=-math.pi, high=math.pi, doc="direction through the gap in world")
     gap: float = setting(0.024, unit="m", low=0.001, high=1.0, doc="between the posts")
     width: float = setting(0.09, unit="m", low=0.001, high=1.0, doc="of a post, across")
     thickness: float = setting(0.012, unit="m", low=0.001, high=1.0, doc="of a post, through")

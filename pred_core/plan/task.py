@@ -12,7 +12,7 @@ import numpy as np
 from pred_core.config import load_config
 from pred_core.dynamics import Dynamics
 from pred_core.errors import ConfigError
-from pred_core.plan.collision_cost import CollisionCost
+from pred_core.plan.collision_cost import CollisionCost, Hand
 from pred_core.plan.config import PlannerConfig
 from pred_core.plan.costs import Cost, Objective
 from pred_core.plan.goal import check_goal
@@ -62,7 +62,8 @@ def make_objective(body: Body, scene: Scene, goal: Array, config: PlannerConfig)
     if c.goal > 0.0 or c.goal_end > 0.0:
         costs.append(GoalCost(points, seen, c.goal, c.goal_end))
     if c.collision > 0.0:
-        costs.append(CollisionCost(scene, body, c.collision, c.margin, c.gripper_radius, c.gripper_length))
+        hand = Hand(c.finger_radius, c.finger_length, c.palm_radius, c.palm_length)
+        costs.append(CollisionCost(scene, body, hand, c.collision, c.margin, hit=c.hit, hand_margin=c.hand_margin))
     if c.smoothness > 0.0:
         costs.append(SmoothnessCost(c.smoothness))
     if c.workspace > 0.0:
