@@ -19,6 +19,12 @@ FREE = CellConfig(mover="free")
 SMALL = ring_of_cameras(2, target=(0.45, 0.0, 0.03), width=160, height=120)
 
 
+@pytest.fixture(scope="module")
+def cell() -> Cell:
+    """A free gripper without cameras; every test begins with a reset."""
+    return Cell(FREE, cameras=())
+
+
 def walk(cell: Cell, *places: tuple[float, float, float], speed: float = 0.25) -> None:
     """Lead the tool through places in the slot's axes, its x axis along the way through."""
     pose = cell.slot.world_from_slot
@@ -48,10 +54,9 @@ def test_the_same_seed_gives_the_same_bits() -> None:
         assert np.array_equal(a, b, equal_nan=True) and np.array_equal(a, c, equal_nan=True)
 
 
-def test_starts_are_drawn_at_rest_on_the_near_side() -> None:
-    cell = Cell(FREE, cameras=())
+def test_starts_are_drawn_at_rest_on_the_near_side(cell: Cell) -> None:
     starts = []
-    for seed in range(3):
+    for seed in range(2):
         truth = cell.reset(seed)
         in_slot = cell.slot.to_slot(truth.rope)
         assert in_slot[:, 0].max() < -0.03 and not cell.judge().threaded
@@ -60,11 +65,10 @@ def test_starts_are_drawn_at_rest_on_the_near_side() -> None:
         assert np.linalg.norm(truth.rope[0] - truth.gripper.position) < 5e-4, "its end is in the jaws"
         assert truth.stamp == 1_000_000_000 and cell.time == 0.0
         starts.append(truth.rope)
-    assert np.abs(starts[0] - starts[1]).max() > 0.02 and np.abs(starts[1] - starts[2]).max() > 0.02
+    assert np.abs(starts[0] - starts[1]).max() > 0.02
 
 
-def test_velocity_is_the_rate_of_position() -> None:
-    cell = Cell(FREE, cameras=())
+def test_velocity_is_the_rate_of_position(cell: Cell) -> None:
     home = cell.reset(0).gripper.position
     for k in range(10):
         cell.step(ToolPose(home + [0.0, 0.0, 0.008 * (k + 1)], cell.reference.rotation))
@@ -75,8 +79,7 @@ def test_velocity_is_the_rate_of_position() -> None:
     assert np.abs(after.rope_velocity).max() > 0.15, "the held end moves with 0.24 m/s"
 
 
-def test_a_rope_led_over_the_slot_and_down_is_through_it() -> None:
-    cell = Cell(FREE, cameras=())
+def test_a_rope_led_over_the_slot_and_down_is_through_it(cell: Cell) -> None:
     cell.reset(0)
     assert not cell.judge().success
     walk(cell, (-0.12, 0.0, 0.13), (0.22, 0.0, 0.13), (0.25, 0.0, 0.05))
@@ -89,8 +92,7 @@ def test_a_rope_led_over_the_slot_and_down_is_through_it() -> None:
     assert cell.touches.count["gripper on slot"] == 0 and cell.touches.count["rope on slot"] >= 1
 
 
-def test_the_gripper_cannot_pass_a_post_and_the_collision_is_counted() -> None:
-    cell = Cell(FREE, cameras=())
+def test_the_gripper_cannot_pass_a_post_and_the_collision_is_counted(cell: Cell) -> None:
     cell.reset(0)
     walk(cell, (-0.1, 0.057, 0.05), (0.06, 0.057, 0.05))
     in_slot = cell.slot.to_slot(cell.truth().gripper.position)
@@ -99,8 +101,7 @@ def test_the_gripper_cannot_pass_a_post_and_the_collision_is_counted() -> None:
     assert cell.touches.count["gripper on slot"] == 1 and cell.touches.seconds["gripper on slot"] > 0.1
 
 
-def test_a_rope_that_slips_out_stays_behind_and_can_be_taken_again() -> None:
-    cell = Cell(FREE, cameras=())
+def test_a_rope_that_slips_out_stays_behind_and_can_be_taken_again(cell: Cell) -> None:
     cell.reset(0)
     walk(cell, (-0.12, 0.0, 0.05))
     cell.jaws.slip()
@@ -119,8 +120,7 @@ def test_a_rope_that_slips_out_stays_behind_and_can_be_taken_again() -> None:
     assert np.linalg.norm(cell.reset(0).rope[0] - cell.truth().gripper.position) < 5e-4, "a reset mends the grasp"
 
 
-def test_jaws_that_close_on_nothing_hold_nothing() -> None:
-    cell = Cell(FREE, cameras=())
+def test_jaws_that_close_on_nothing_hold_nothing(cell: Cell) -> None:
     cell.reset(0)
     cell.jaws.open()
     walk(cell, (-0.1, 0.0, 0.2))
