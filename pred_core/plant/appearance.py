@@ -25,12 +25,15 @@ def dress_spec(spec: mujoco.MjSpec, seed: int = 0) -> None:
     spec.geom(GROUND).material = TABLE
 
 
-def cover(spec: mujoco.MjSpec, name: str, picture: NDArray[np.uint8], repeat: float) -> None:
-    """Add a material `name` that shows a picture (H, W, 3), `repeat` times a metre on planes."""
+def cover(spec: mujoco.MjSpec, name: str, picture: NDArray[np.uint8], repeat: float, uniform: bool = True) -> None:
+    """Add a material `name` that shows a picture (H, W, 3), `repeat` times a metre.
+
+    uniform False: over the texture coordinates of the object, with which it moves and bends.
+    """
     texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D)
     texture.height, texture.width, texture.nchannel = picture.shape
     texture.data = picture.tobytes()
-    material = spec.add_material(name=name, texrepeat=[repeat, repeat], texuniform=True, specular=0.05)
+    material = spec.add_material(name=name, texrepeat=[repeat, repeat], texuniform=uniform, specular=0.05)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
 
 

@@ -14,6 +14,7 @@ from pred_core.track.estimate import Estimate, Prior
 from pred_core.track.grasp import GripperPath
 from pred_core.track.line_tracker import LineConfig, LineTracker
 from pred_core.track.mask import ObjectMask
+from pred_core.track.surface_tracker import SurfaceConfig, SurfaceTracker
 from pred_core.track.view import View, check_frame
 from pred_core.track.workspace import Shape, Workspace, check_workspace
 from pred_core.types import Array, CameraFrame, Capsule
@@ -32,6 +33,7 @@ class TrackerConfig:
     arm_end: float = setting(0.4, unit="m", low=-0.5, high=2.0, doc="from the tool centre along the gripper's +z")
     workspace: Workspace = Workspace()
     line: LineConfig = LineConfig()
+    surface: SurfaceConfig = SurfaceConfig()
 
 
 class Tracker:
@@ -52,7 +54,7 @@ class Tracker:
         self.fixtures: tuple[Shape, ...] = ()
         self.robot: tuple[Shape, ...] = ()
         self.stale = 0  # pictures that came too late to be used
-        self._line = LineTracker(config.line)
+        self._line, self._surface = LineTracker(config.line), SurfaceTracker(config.surface)
         self._path = GripperPath()
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
         self._frames: dict[str, CameraFrame] = {}  # new ones
@@ -84,7 +86,7 @@ class Tracker:
         if camera not in self.cameras:
             raise InputError(f"unknown camera '{camera}'", next_step=nearest(camera, self.cameras))
         check_frame(frame, camera)
-        if frame.stamp < self._line.stamp - self.config.window * 1e9:
+        if frame.stamp < self._stamp - self.config.window * 1e9:
             self.stale += 1
             return
         self._frames[camera] = frame
@@ -94,10 +96,11 @@ class Tracker:
         if not self._frames:
             return None
         frames, self._frames = self._frames, {}
-        stamp = max(max(f.stamp for f in frames.values()), self._line.stamp)
+        stamp = max(max(f.stamp for f in frames.values()), self._stamp)
         poses = self._path.at(stamp)
         self.mask.shapes = (*self.fixtures, *self.robot, *self._arms(poses))
-        self._views.update({c: self.mask.view(c, f) for c, f in frames.items()})
+        if self.config.kind == "line" or self._searching:
+            self._views.update({c: self.mask.view(c, f) for c, f in frames.items()})
         oldest = stamp - self.config.window * 1e9
         self._views = {c: v for c, v in self._views.items() if v.stamp >= oldest}
         views = [self._views[c] for c in self.cameras if c in self._views]
@@ -106,14 +109,21 @@ class Tracker:
                 return None
             views = [self._views[v.camera] for v in views]
         prior = self._prior if self._prior is not None and abs(stamp - self._prior.stamp) * 1e-9 < 0.5 else None
-        estimate = self._line.update(views, stamp, poses, prior)
+        if self.config.kind == "line":
+            estimate = self._line.update(views, stamp, poses, prior)
+        else:
+            estimate = self._surface.update(frames, stamp, poses, prior)
         if estimate.status == "lost":
             self._searching = True
         return estimate
 
+    @property
+    def _stamp(self) -> int:
+        return self._line.stamp if self.config.kind == "line" else self._surface.stamp
+
     def reset(self) -> None:
         """Forget the object; it is searched in the next pictures."""
-        self._line = LineTracker(self.config.line)
+        self._line, self._surface = LineTracker(self.config.line), SurfaceTracker(self.config.surface)
         self.mask.color = None
         self._frames, self._views, self._searching = {}, {}, True
 
@@ -122,6 +132,9 @@ class Tracker:
     ) -> bool:
         if not any(len(v.pixel) for v in views):
             return False
+        if self.config.kind != "line":
+            self._searching = not self._surface.start(views, frames, stamp, poses, self._closed)
+            return not self._searching
         members = self._line.start(views, stamp, poses, self._closed)
         if not members:
             return False
