@@ -75,7 +75,10 @@ def test_bags_hold_the_wire_and_nothing_else(tmp_path: Path) -> None:
         return watchers[-1]
 
     done: list[str] = []
-    dataset = collect(tmp_path / "set", make, lambda *about: done.append(about[2]), SHORT, FREE)
+    dataset = collect(
+        tmp_path / "set", make, lambda *about: done.append(about[2]), SHORT, FREE, measured={"radius": 0.004}
+    )
+    assert dataset.known == {"ground": 0.0, "radius": 0.004}
     assert done == ["ep000", "ep001"] and [e.split for e in dataset.entries] == ["train", "test"]
     bag = open_bag(tmp_path / "set" / "ep000.mcap")
     assert set(bag.topics) == {"tracker/points", "gripper/pose", "gripper/closed", *(f"cam{k}/pose" for k in range(4))}

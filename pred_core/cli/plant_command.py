@@ -53,6 +53,8 @@ def _configure_cell(worlds: Any) -> None:
     cell.add_argument("--cable", type=int, default=0, help="0: the nominal cable; else the seed of a drawn one")
     cell.add_argument("--gap", type=float, default=0.024, help="of the slot [m]")
     cell.add_argument("--mover", choices=("arm", "free"), default="arm", help="an arm, or a gripper without one")
+    cell.add_argument("--mass", type=float, help="of the rope, if you weighed it [kg]")
+    cell.add_argument("--radius", type=float, help="of the rope, if you measured it [m]")
     cell.add_argument("--pictures", action="store_true", help="keep the pictures in the bags, compressed")
     cell.set_defaults(make=_collect)
     sample = worlds.add_parser("sample", help="write the small bag of four cameras that ships in bags/")
@@ -93,7 +95,8 @@ def _collect(args: argparse.Namespace) -> int:
     cell = CellConfig(mover=args.mover, cable=args.cable)
     check_ranges(campaign, "pred plant collect")
     check_ranges(cell, "pred plant collect")
-    dataset = collect(args.out, TrackerWatcher, progress_line(), campaign, cell, args.gap)
+    measured = {name: value for name in ("mass", "radius") if (value := getattr(args, name)) is not None}
+    dataset = collect(args.out, TrackerWatcher, progress_line(), campaign, cell, args.gap, measured)
     counts = ", ".join(f"{len(dataset.select(s))} {s}" for s in dataset.splits)
     print(f"{dataset.root}: {len(dataset.entries)} episodes ({counts})")
     return 0

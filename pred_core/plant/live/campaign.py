@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,9 +46,12 @@ def collect(
     campaign: CampaignConfig | None = None,
     cell: CellConfig | None = None,
     gap: float = SlotConfig.gap,
+    measured: Mapping[str, float] | None = None,
 ) -> Dataset:
-    """Record the episodes that are not there yet, then write dataset.yaml. What it says of the object is measured or
-    asked of nobody; the table's height is the rig's.
+    """Record the episodes that are not there yet, then write dataset.yaml.
+
+    measured: what a person finds out with scale and caliper (mass [kg], radius [m]); it goes into `known` beside the
+    height of the table, which is the rig's. Nothing else is said of the object.
 
     Raises: ConfigError for a rate that is no whole number of ticks; DatasetError if `root` holds something else;
     InputError if the tracker sees the rope too rarely.
@@ -82,7 +85,7 @@ def collect(
                 record(path, station, route, campaign.seconds, make_watcher(made), keeping)
             progress(number + 1, len(plan), path.stem)
     entries = [EpisodeEntry(f"ep{n:03d}.mcap", split, n) for n, (split, _) in enumerate(plan)]
-    known = {"ground": 0.0}
+    known = {"ground": 0.0, **(measured or {})}
     return write_dataset(
         root, object=ObjectInfo("rope", "line"), rate=campaign.rate, entries=entries, held=HELD, known=known
     )
