@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pred_core.config import setting
 from pred_core.errors import InputError
@@ -20,7 +21,8 @@ class GraspConfig:
 
     radius: float = setting(0.03, unit="m", low=0.0, high=0.3, doc="particles this near to a closing gripper are held")
     sigma: float = setting(0.0015, unit="m", low=1e-4, high=0.05, doc="of a held particle in the gripper's frame")
-    slip: float = setting(0.02, unit="m", low=1e-3, high=0.3, doc="seen this far off, it has slipped out")
+    slip: float = setting(0.03, unit="m", low=1e-3, high=0.3, doc="the object seen farther off by this has slipped out")
+    patience: float = setting(0.2, unit="s", low=0.0, high=10.0, doc="for so long before the grasp is given up")
 
 
 class GripperPath:
@@ -66,11 +68,14 @@ class Grasp:
         self.config = config
         self.held: NDArray[np.int64] = np.zeros(0, np.int64)  # (P,) gripper or -1
         self._local: Array = np.zeros((0, 3))
+        self._usual = 0.0  # [m] from the held particles to the nearest point seen, when they were bound
+        self._off_since: int | None = None
 
     def bind(self, position: Array, poses: tuple[Array, Array] | None, closed: NDArray[np.bool_]) -> None:
         """Hold the particles (P, 3) [m] that are near to closed grippers now, and no others."""
         self.held = np.full(len(position), -1, np.int64)
         self._local = np.zeros_like(position)
+        self._usual, self._off_since = -1.0, None
         if poses is None:
             return
         for gripper, (place, turn) in enumerate(zip(*poses, strict=True)):
@@ -88,6 +93,23 @@ class Grasp:
         place, turn = poses
         index = self.held[held]
         return held, place[index] + np.einsum("hab,hb->ha", turn[index], self._local[held])
+
+    def watch(self, place: Array, points: Array, stamp: int) -> bool:
+        """True if the object has slipped out: for some time nothing is seen near the held particles' places (H, 3).
+
+        points (M, 3) [m] are what the cameras see of the object. The first call after `bind` sets what is usual: jaws
+        hide what they hold.
+        """
+        if not len(place) or not len(points):
+            return False
+        gap = float(cKDTree(points).query(place)[0].min())
+        if self._usual < 0.0:
+            self._usual = gap
+        if gap < self._usual + self.config.slip:
+            self._off_since = None
+            return False
+        self._off_since = stamp if self._off_since is None else self._off_since
+        return (stamp - self._off_since) * 1e-9 >= self.config.patience
 
     def release(self) -> None:
         """Hold nothing."""

@@ -100,6 +100,9 @@ class LineTracker:
         expected, sigma = self._predict(dt, stamp, poses, prior)
         information = np.eye(3) / (sigma**2)[:, None, None]
         held, place = self.grasp.targets(poses)
+        if self.grasp.watch(place, np.concatenate([v.points for v in views]), stamp):
+            self.grasp.release()
+            held, place = self.grasp.targets(poses)
         information[held] = np.eye(3) / self.config.grasp.sigma**2
         expected[held] = place
         cloud = self._cloud([_near(v, expected, self.config.fit.reach) for v in views], stamp, self.radius)

@@ -235,7 +235,7 @@ def spread(points: Array, count: int) -> Array:
 def _in_view(pixel: Array, depth: Array, frame: CameraFrame, occluder: float, border: int = 2) -> NDArray[np.bool_]:
     """(P,) inside the picture, with depth measured there that agrees."""
     height, width = frame.depth.shape
-    inside = np.isfinite(pixel).all(axis=-1)
+    inside: NDArray[np.bool_] = np.asarray(np.isfinite(pixel).all(axis=-1))
     safe = np.where(inside[:, None], pixel, -1.0)
     inside &= (safe >= border).all(axis=-1) & (safe[:, 0] < width - border) & (safe[:, 1] < height - border)
     seen = depth_at(frame.depth, safe)

@@ -94,7 +94,7 @@ def sample(gray: Gray, pixel: Array, warp: Array) -> NDArray[np.float32]:
 
 def _gradients(patch: NDArray[np.float32]) -> tuple[Array, Array]:
     square = patch.reshape(-1, SIDE, SIDE).astype(np.float64)
-    gy, gx = np.gradient(square, axis=(1, 2))
+    gx, gy = (np.asarray(np.gradient(square, axis=a)) for a in (2, 1))
     return gx.reshape(len(patch), -1), gy.reshape(len(patch), -1)
 
 
