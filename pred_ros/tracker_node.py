@@ -29,6 +29,7 @@ from pred_core.config import setting
 from pred_core.errors import ConfigError, PredError
 from pred_core.track.estimate import Estimate, Prior
 from pred_core.track.line_tracker import LineConfig
+from pred_core.track.surface_tracker import SurfaceConfig
 from pred_core.track.tracker import MOST_CAMERAS, Tracker, TrackerConfig
 from pred_core.track.workspace import Workspace
 from pred_core.types import Box
@@ -77,6 +78,7 @@ def core_config(config: TrackerNodeConfig) -> TrackerConfig:
         arm_end=config.arm_end,
         workspace=Workspace(low, high, config.table),
         line=LineConfig(length=config.length, radius=config.radius, particles=config.particles),
+        surface=SurfaceConfig(particles=config.particles),
     )
 
 

@@ -52,13 +52,14 @@ class _Eye:
 
 
 class SurfaceTracker:
-    """Holds the particles; ids count from 0 and stay."""
+    """Holds the particles; ids count from 0 and stay. One that is lost and found again goes on with new ids."""
 
     def __init__(self, config: SurfaceConfig):
         self.config = config
         self.grasp = Grasp(config.grasp)
         self.stamp = 0
         self.position: Array | None = None  # (P, 3) [m] world
+        self._first_id = 0  # a sheet found again has new material points, so it gets new ids
         self.velocity: Array = np.zeros((0, 3))
         self._eyes: dict[str, _Eye] = {}
         self._measured_at = 0
@@ -75,6 +76,7 @@ class SurfaceTracker:
         points = np.concatenate([v.points for v in views])
         if len(points) < 4 * self.config.particles:
             return False
+        self._first_id += 0 if self.position is None else len(self.position)
         position = spread(_largest_part(points), self.config.particles)
         self.position, self.stamp, self._measured_at = position, stamp, stamp
         self.velocity = np.zeros_like(position)
@@ -93,9 +95,10 @@ class SurfaceTracker:
         dt = max((stamp - self.stamp) * 1e-9, 0.0)
         expected = self.position + dt * self.velocity
         if prior is not None:
-            known = prior.id < len(expected)
+            row = prior.id.astype(np.int64) - self._first_id
+            known = (row >= 0) & (row < len(expected))
             later = (stamp - prior.stamp) * 1e-9
-            expected[prior.id[known].astype(int)] = prior.position[known] + later * prior.velocity[known]
+            expected[row[known]] = prior.position[known] + later * prior.velocity[known]
         total, weight = np.zeros_like(expected), np.zeros(len(expected))
         for camera, frame in frames.items():
             measured, strength = self._measure(camera, frame, expected)
@@ -194,7 +197,7 @@ class SurfaceTracker:
         tracks = Tracks(
             np.int64(self.stamp),  # type: ignore[arg-type]
             self.position.copy(),
-            np.arange(len(self.position), dtype=np.uint32),
+            self._first_id + np.arange(len(self.position), dtype=np.uint32),
             visible,
             trace_confidence(covariance, visible),
         )

@@ -1,0 +1,158 @@
+"""Sheets and volumes: flow, patches and rigidity on known motions; a patterned board that is really moved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+pytest.importorskip("cv2", reason="OpenCV is not installed")
+
+import mujoco
+
+from pred_core.plant.appearance import cover, dress_spec, speckled_picture
+from pred_core.plant.cameras import Cameras, ring_of_cameras
+from pred_core.plant.rope import GROUND
+from pred_core.track.flow import depth_at, follow_pixels
+from pred_core.track.paper_rollout import PaperRollout
+from pred_core.track.rigidity import RigidityGraph
+from pred_core.track.surface_tracker import SurfaceConfig, spread
+from pred_core.track.template import Templates
+from pred_core.track.tracker import Tracker, TrackerConfig
+from pred_core.track.workspace import Workspace
+from pred_core.types import Array, CameraFrame
+
+START, STEP = 1_000_000_000, 66_000_000  # [ns]
+CONFIG = TrackerConfig(
+    kind="sheet", workspace=Workspace((-0.5, -0.5, 0.02), (0.5, 0.5, 0.6)), surface=SurfaceConfig(particles=120)
+)
+
+
+class Board:
+    """A printed board, 30 cm x 20 cm, that is put anywhere; two cameras of 320 x 240 on one side."""
+
+    def __init__(self) -> None:
+        spec = mujoco.MjSpec()
+        spec.worldbody.add_geom(name=GROUND, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1])
+        dress_spec(spec)
+        cover(spec, "print", speckled_picture(np.random.default_rng(0), (0.8, 0.2, 0.2), 256, 12), 1.0, uniform=False)
+        body = spec.worldbody.add_body(name="board", mocap=True, pos=[0, 0, 0.2])
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.15, 0.1, 0.004], material="print")
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self.cameras = Cameras(self.model, ring_of_cameras(2, (0.0, 0.0, 0.2), 0.8, 1.2, width=320, height=240))
+        self.generator = np.random.default_rng(0)
+
+    def frames(self, stamp: int, shift: Array, yaw: float) -> dict[str, CameraFrame]:
+        """Pictures with the board moved by `shift` [m] and turned by `yaw` [rad]."""
+        self.data.mocap_pos[0] = np.array([0.0, 0.0, 0.2]) + shift
+        self.data.mocap_quat[0] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
+        mujoco.mj_forward(self.model, self.data)
+        return {n: self.cameras.frame(self.data, n, stamp, self.generator) for n in self.cameras.configs}
+
+
+@pytest.fixture(scope="module")
+def board() -> Iterator[Board]:
+    made = Board()
+    yield made
+    made.cameras.close()
+
+
+def speckle(shift: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """A smooth random picture (120, 160), moved by whole pixels (right, down)."""
+    from scipy.ndimage import gaussian_filter
+
+    noise = gaussian_filter(np.random.default_rng(4).normal(0.0, 1.0, (120, 160)), 2.0, mode="wrap")
+    picture = 128 + 40 * noise / noise.std()
+    return np.roll(np.clip(picture, 0, 255).astype(np.uint8), (shift[1], shift[0]), (0, 1))
+
+
+def test_flow_finds_a_known_shift_and_refuses_what_is_hidden() -> None:
+    after = speckle((4, 2))
+    after[80:] = 128  # the lower part is covered
+    pixel = np.array([[50.0, 40.0], [90.0, 30.0], [60.0, 100.0]])
+    there, good = follow_pixels(speckle(), after, pixel, pixel)
+    np.testing.assert_allclose(there[:2] - pixel[:2], [[4.0, 2.0]] * 2, atol=0.1)
+    assert good.tolist() == [True, True, False]
+
+
+def test_first_seen_patch_corrects_a_wrong_pixel() -> None:
+    templates = Templates.empty(2)
+    pixel = np.array([[50.0, 40.0], [90.0, 60.0]])
+    tangents = np.tile(np.eye(2), (2, 1, 1))
+    templates.keep(speckle(), np.array([0, 1]), pixel, tangents, np.zeros((2, 3)))
+    wrong = pixel + [[4.0 + 1.2, 2.0 - 0.9], [4.0 + 30.0, 2.0]]
+    found, correlation = templates.match(speckle((4, 2)), np.array([0, 1]), wrong, tangents)
+    np.testing.assert_allclose(found[0], pixel[0] + [4.0, 2.0], atol=0.1)
+    assert correlation[0] > 0.95 and correlation[1] == 0.0, "30 px off is no match"
+
+
+def test_depth_at_an_edge_is_none() -> None:
+    depth = np.ones((20, 20), np.float32)
+    depth[:, 10:] = 1.5
+    depth[4, 4] = np.nan
+    found = depth_at(depth, np.array([[5.0, 4.0], [9.6, 10.0], [0.0, 0.0], [15.0, 15.0]]))
+    np.testing.assert_allclose(found[[0, 3]], [1.0, 1.5])
+    assert np.isnan(found[1]) and np.isnan(found[2])
+
+
+def test_rigid_motion_of_a_few_carries_all() -> None:
+    x, y = np.meshgrid(np.arange(8) * 0.03, np.arange(6) * 0.03)
+    rest = np.stack([x.ravel(), y.ravel(), np.zeros(48)], axis=-1)
+    c, s = np.cos(0.4), np.sin(0.4)
+    truth = rest @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [0.1, 0.0, 0.05]
+    weight = np.full(48, 1e-6)
+    weight[[0, 7, 40, 47]] = 10.0
+    found = RigidityGraph(rest).solve(rest, truth * (weight > 1)[:, None], weight, 2.0, rounds=60)
+    assert np.linalg.norm(found - truth, axis=-1).max() < 0.002  # the corners' motion reaches the middle
+
+
+def test_spread_covers_evenly() -> None:
+    points = np.random.default_rng(0).uniform(0.0, 0.3, (5000, 3)) * [1.0, 1.0, 0.0]
+    found = spread(points, 100)
+    from scipy.spatial import cKDTree
+
+    gap = cKDTree(found).query(found, k=2)[0][:, 1]
+    assert gap.min() > 0.012  # 100 points on 0.3 m x 0.3 m: 3 cm apart on a grid, at worst half of it
+
+
+def test_board_is_followed_and_the_rollout_drifts(board: Board) -> None:
+    tracker = Tracker(CONFIG, ["cam0", "cam1"])
+    error, drift = [], []
+    first = paper = None
+    for k in range(12):
+        shift, yaw = np.array([0.008, 0.004, 0.0]) * k, 0.02 * k  # 0.14 m/s
+        frames = board.frames(START + k * STEP, shift, yaw)
+        for name, frame in frames.items():
+            tracker.add_frame(name, frame)
+        estimate = tracker.step()
+        assert estimate is not None
+        first = estimate.tracks.position if first is None else first
+        paper = paper or PaperRollout(first)
+        rolled = paper.step(frames, [tracker.mask.view(n, f) for n, f in frames.items()])
+        c, s = np.cos(yaw), np.sin(yaw)
+        truth = first @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + shift
+        error.append(np.linalg.norm(estimate.tracks.position - truth, axis=-1).mean())
+        drift.append(np.linalg.norm(rolled - truth, axis=-1).mean())
+    assert estimate.tracks.visible.mean() > 0.8 and estimate.status == "tracking"
+    assert error[-1] < 0.005  # a pixel is 2.7 mm
+    assert error[-1] < drift[-1]
+
+
+def test_covered_sheet_is_unseen_then_lost(board: Board) -> None:
+    tracker = Tracker(CONFIG, ["cam0", "cam1"])
+    for k in range(22):
+        frames = board.frames(START + k * STEP, np.zeros(3), 0.0)
+        for name, frame in frames.items():
+            if k >= 3:
+                frame.depth[:] = 0.2
+                frame.rgb[:] = 0
+            tracker.add_frame(name, frame)
+        estimate = tracker.step()
+        if k == 5:
+            assert estimate is not None and not estimate.tracks.visible.any() and estimate.status == "tracking"
+        if estimate is not None and estimate.status == "lost":
+            break
+    assert tracker.searching, "1.0 s without a measurement"
