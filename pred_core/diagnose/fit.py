@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from pred_core.diagnose.roll import Roller
+from pred_core.diagnose.roll import MOST_FACTOR, Roller
 from pred_core.diagnose.weigh import Weights, seen_of
 from pred_core.identify.space import SearchSpace
 from pred_core.types import Array
@@ -42,6 +43,17 @@ class Target:
     roller: Roller
     weights: Weights  # (W, K, N)
     stride: int
+
+    def part(self, episodes: Sequence[int]) -> Target:
+        """Only some episodes."""
+        sample = self.roller.sample
+        keep = sample.windows_of(episodes)
+        return Target(Roller(self.roller.twin, sample.part(episodes)), self.weights[torch.as_tensor(keep)], self.stride)
+
+    def some(self, windows: Array) -> Target:
+        """Only some windows."""
+        sample = self.roller.sample
+        return Target(Roller(self.roller.twin, sample.some(windows)), self.weights[torch.as_tensor(windows)], self.stride)
 
     def losses(self, space: SearchSpace, points: Sequence[Array]) -> Array:
         """(C, E) losses of points."""
@@ -94,13 +106,25 @@ def rho(u: Tensor) -> Tensor:
     return square / ((1.0 + square).sqrt() + 1.0)
 
 
-def fit(target: Target, space: SearchSpace, z: Array, iterations: int, chosen: Array | None = None) -> Fit:
-    """The local optimum near z, on all episodes or on `chosen` (E,) bool."""
+def fit(
+    target: Target,
+    space: SearchSpace,
+    z: Array,
+    iterations: int,
+    chosen: Array | None = None,
+    most: float = MOST_FACTOR,
+) -> Fit:
+    """The local optimum near z, on all episodes or on `chosen` (E,) bool.
+
+    Steps to where more than `most` times the substeps of the start are needed are not taken: what the data do not
+    show (axial damping) must not make the simulation slow.
+    """
     lower, upper = (np.array(b) for b in space.bounds())
     z = np.clip(np.asarray(z, dtype=np.float64), lower, upper)
     origin = z.copy()
     use = np.ones(target.roller.sample.episodes, dtype=bool) if chosen is None else chosen
     damping = 1e-2
+    limit = most * max(target.roller.demand(space.candidate(z)), target.roller.usual())
     loss, gradient, curvature, substeps = target.linearize(space, z)
     for _ in range(iterations):
         g = gradient[use].mean(axis=0) + PRIOR * (z - origin)
@@ -110,6 +134,9 @@ def fit(target: Target, space: SearchSpace, z: Array, iterations: int, chosen: A
         for _ in range(PATIENCE):
             move = -np.linalg.solve(h + damping * np.diag(np.diag(h)) + 1e-12 * np.eye(len(z)), g)
             trial = np.clip(z + np.clip(move, -LONGEST, LONGEST), lower, upper)
+            if target.roller.demand(space.candidate(trial)) > limit:
+                damping *= 8.0
+                continue
             finer = max(substeps, target.roller.substeps([space.candidate(trial)]))
             tried = target.per_episode(rho(target.residuals(space, [trial], finer)))[0]
             after = float(tried[use].mean()) + 0.5 * PRIOR * float(((trial - origin) ** 2).sum())
@@ -126,17 +153,17 @@ def fit(target: Target, space: SearchSpace, z: Array, iterations: int, chosen: A
     return Fit(z, loss, gradient, curvature)
 
 
-def without_groups(result: Fit, space: SearchSpace, groups: Array, use: Array) -> dict[int, Array]:
-    """group -> coordinates that the other groups of the episodes in `use` give, by one Newton step from the fit."""
+def without_groups(result: Fit, space: SearchSpace, groups: NDArray[np.int64]) -> dict[int, Array]:
+    """group -> coordinates that the other groups' episodes give, by one Newton step from the fit; groups (E,)."""
     lower, upper = (np.array(b) for b in space.bounds())
     points = {}
     size = len(result.z)
-    for group in sorted(set(groups[use].tolist())):
-        rest = use & (groups != group)
+    for group in sorted(set(groups.tolist())):
+        rest = groups != group
         if not rest.any():
             continue
         h = result.curvature[rest].mean(axis=0) + PRIOR * np.eye(size)
         h += 1e-6 * np.trace(h) / size * np.eye(size)
-        move = -np.linalg.solve(h, result.gradient[rest].mean(axis=0) - result.gradient[use].mean(axis=0))
+        move = -np.linalg.solve(h, result.gradient[rest].mean(axis=0) - result.gradient.mean(axis=0))
         points[int(group)] = np.clip(result.z + np.clip(move, -LONGEST, LONGEST), lower, upper)
     return points

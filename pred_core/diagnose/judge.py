@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import ACTS, Judged
 from pred_core.diagnose.fit import Fit, Target, fit, rho, without_groups
-from pred_core.diagnose.search import Start, coordinates, refine_trial, starts
-from pred_core.diagnose.trial import Trial, make_trial
+from pred_core.diagnose.search import Start, refine_trial, starts
+from pred_core.diagnose.trial import Trial, make_trial, scanned
 from pred_core.effects.effect import Effect
-from pred_core.identify.space import Candidate
 from pred_core.twin import Twin
 from pred_core.types import Array
 
+NULL_STEPS = 4  # of a candidate's refinement on the reference
 Tell = Callable[[str], None]
 Effects = tuple[type[Effect], ...]
 
@@ -27,11 +27,13 @@ class Bench:
     """The suspect set and, if there is one, the reference, each with the twin that describes it so far."""
 
     twin: Twin
-    target: Target
+    target: Target  # all episodes: to judge on
+    fitted: Target  # its train episodes: to fit on
     reference_twin: Twin
     reference: Target | None
     config: DiagnoseConfig
     physics: tuple[str, ...] = ()  # base parameters that every candidate refits: without a reference, all of them
+    nulls: dict[str, dict[str, float]] = field(default_factory=dict)  # candidate -> what the reference says of it
 
     @property
     def train(self) -> NDArray[np.bool_]:
@@ -62,33 +64,29 @@ class Screened:
 def screen(bench: Bench, effects: Effects, rng: np.random.Generator) -> Screened:
     """Where to start a candidate, and how much it promises beyond what the reference already gives it."""
     trial = bench.trial(effects)
-    found = starts(bench.target, trial, bench.config.places, rng)
+    found = starts(bench.fitted, trial, bench.config.places, rng)
     return Screened(effects, trial, found, found[0].promise, trial.space.start())
 
 
-def null_of(bench: Bench, screened: Screened, like: Array | None) -> Array:
+def null_of(bench: Bench, screened: Screened) -> Array:
     """Coordinates of "no change": what the reference says of the candidate's parameters, else off.
 
-    `like`: coordinates the suspect set gives; the reference is fitted from there too, because what engine and object
-    lack in common would otherwise count as a change.
+    What the engine and the object lack in common would otherwise count as a change. A localized cause, which the
+    reference cannot have in the same place, is off.
     """
-    if bench.reference is None:
+    trial = screened.trial
+    if bench.reference is None or any(scanned(e) for e in screened.effects):
         return screened.null
-    trial = make_trial(bench.reference_twin, screened.effects, ())
-    begins = [trial.space.start()]
-    if like is not None:
-        begins.append(_moved(screened.trial, trial, like, 0.2))
-    best = None
-    for begin in begins:
-        result = fit(bench.reference, trial.space, begin, max(3, bench.config.iterations // 2))
-        if best is None or result.loss.mean() < best.loss.mean():
-            best = result
-    assert best is not None
-    at_reference = trial.space.candidate(best.z)
-    freed = set(screened.trial.ids)
-    values = {e.id: e for e in at_reference.extensions if e.id in freed}
-    extensions = tuple(values.get(e.id, e) for e in screened.trial.space.extensions)
-    return coordinates(screened.trial.space, Candidate(screened.trial.space.physics, extensions))
+    if trial.id not in bench.nulls:
+        other = make_trial(bench.reference_twin, screened.effects, ())
+        result = fit(bench.reference, other.space, other.space.start(), NULL_STEPS)
+        bench.nulls[trial.id] = other.space.values(result.z)
+    values = bench.nulls[trial.id]
+    null = screened.null.copy()
+    for n, knob in enumerate(trial.space.knobs):
+        if knob.name in values:
+            null[n] = knob.coordinate(values[knob.name])
+    return null
 
 
 def judge(bench: Bench, screened: Screened, begin: Sequence[Array] = ()) -> tuple[Judged, Fit]:
@@ -96,10 +94,10 @@ def judge(bench: Bench, screened: Screened, begin: Sequence[Array] = ()) -> tupl
     trial, space, target = screened.trial, screened.trial.space, bench.target
     train = bench.train
     found = [Start(z, 0.0) for z in begin] or screened.starts
-    result = refine_trial(target, trial, found, bench.config.iterations, train)
-    null = null_of(bench, screened, result.z)
+    result = refine_trial(bench.fitted, trial, found, bench.config.iterations)
+    null = null_of(bench, screened)
     sample = target.roller.sample
-    left_out = without_groups(result, space, sample.groups, train)
+    left_out = without_groups(result, space, sample.groups[train])
     points = [null, result.z, *left_out.values()]
     u = target.residuals(space, points)
     losses = target.per_episode(rho(u))
@@ -123,19 +121,6 @@ def judge(bench: Bench, screened: Screened, begin: Sequence[Array] = ()) -> tupl
         ),
         result,
     )
-
-
-def _moved(source: Trial, target: Trial, z: Array, share: float) -> Array:
-    """Coordinates in another trial's space, the switches reduced to a share of what they are."""
-    names = {k.name: n for n, k in enumerate(source.space.knobs)}
-    result = target.space.start()
-    for n, knob in enumerate(target.space.knobs):
-        if knob.name in names:
-            value = source.space.knobs[names[knob.name]].value(float(z[names[knob.name]]))
-            result[n] = knob.coordinate(value)
-    for n in target.amplitudes:
-        result[n] *= share
-    return result
 
 
 def _intervals(trial: Trial, z: Array, left_out: Array) -> dict[str, tuple[float, float]]:

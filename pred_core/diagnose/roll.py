@@ -12,7 +12,6 @@ from torch import Tensor
 
 from pred_core.diagnose.sample import Sample
 from pred_core.effects import find_effect
-from pred_core.identify.problem import RUNGS
 from pred_core.identify.space import Candidate
 from pred_core.springmass import SpringMass
 from pred_core.springmass.arrays import mass_of_worlds
@@ -23,7 +22,8 @@ from pred_core.types import Array, Grip, State
 
 FARTHEST = 0.5  # [m] a coordinate's error counts with at most; also where the simulation is not finite
 MOST_WORLDS = 1536  # in one kernel call
-MOST_FACTOR = 6.0  # times the twin's substeps: candidates that need more are not simulated
+LADDER = (1.0, 1.15, 1.35, 1.6, 2.0, 2.5, 3.2, 4.0)  # times the substeps the twin needs: what candidates get
+MOST_FACTOR = LADDER[-1]
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ class Roller:
 
     def substeps(self, candidates: Sequence[Candidate]) -> int:
         """One number for all: the most demanding one's, a rung, at least the twin's own, within reason."""
-        own = self.twin.meta.substeps or 1
-        needed = max(own, math.ceil(max(self.demand(c) for c in candidates)))
-        needed = min(needed, math.ceil(MOST_FACTOR * max(own, self._usual())))
-        return next((r for r in RUNGS if r >= needed), needed) if needed > own else own
+        usual = self.usual()
+        needed = max(self.demand(c) for c in candidates) / usual
+        return math.ceil(usual * next((f for f in LADDER if f >= needed), LADDER[-1]))
 
-    def _usual(self) -> float:
+    def usual(self) -> float:
+        """Substeps a period that keep the twin as it is stable."""
         return self.demand(Candidate(self.twin.physics, self.twin.extensions))
 
     def errors(self, candidates: Sequence[Candidate], stride: int = 1, substeps: int | None = None) -> Tensor:

@@ -45,21 +45,34 @@ class Sample:
         """Number of episodes E."""
         return len(self.names)
 
+    def windows_of(self, episodes: Sequence[int]) -> NDArray[np.int64]:
+        """Indices of the windows of some episodes, in the order `part` has them."""
+        place = {e: n for n, e in enumerate(episodes)}
+        keep = np.flatnonzero(np.isin(self.episode, list(episodes)))
+        return np.asarray(keep[np.lexsort(([place[e] for e in self.episode[keep].tolist()], self.order[keep]))])
+
     def part(self, episodes: Sequence[int]) -> Sample:
         """Only some episodes, in the given order."""
         place = {e: n for n, e in enumerate(episodes)}
-        keep = np.flatnonzero(np.isin(self.episode, list(episodes)))
-        keep = keep[np.lexsort(([place[e] for e in self.episode[keep].tolist()], self.order[keep]))]
-        return Sample(
+        some = self.some(self.windows_of(episodes))
+        return dataclasses.replace(
+            some,
             names=tuple(self.names[e] for e in episodes),
             groups=self.groups[list(episodes)],
             splits=tuple(self.splits[e] for e in episodes),
-            windows=_windows_at(self.windows, torch.as_tensor(keep)),
-            episode=np.array([place[e] for e in self.episode[keep].tolist()], dtype=np.int64),
-            order=self.order[keep],
-            frame=self.frame[keep],
-            time=self.time[torch.as_tensor(keep)],
-            noise=self.noise,
+            episode=np.array([place[e] for e in some.episode.tolist()], dtype=np.int64),
+        )
+
+    def some(self, windows: NDArray[np.int64]) -> Sample:
+        """Only some windows; the list of episodes stays."""
+        rows = torch.as_tensor(windows)
+        return dataclasses.replace(
+            self,
+            windows=_windows_at(self.windows, rows),
+            episode=self.episode[windows],
+            order=self.order[windows],
+            frame=self.frame[windows],
+            time=self.time[rows],
         )
 
     def per_episode(self, values: Array) -> Array:

@@ -17,7 +17,8 @@ from pred_core.twin import Extension
 from pred_core.types import Array
 
 SECANT = 0.7  # typical changes of the switch, over which a first slope is taken
-TRIED = 3  # starts of a localized cause that are refined
+SCANNED = 16  # windows in which places are tried, those with the largest loss: one block of worlds
+TRIED = 2  # starts of a localized cause that are refined
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,14 @@ def starts(target: Target, trial: Trial, count: int, rng: np.random.Generator) -
     if not trial.amplitudes:
         return [Start(space.start(), 0.0)]
     null = space.start()
-    now = target.residuals(space, [null])
     origins = [null]
+    now = target.residuals(space, [null])
+    if scanning and target.roller.sample.windows.count > SCANNED:  # where the error is, something can be found
+        worst = rho(now[0]).sum(dim=(1, 2, 3)).argsort(descending=True)[:SCANNED].sort().values
+        share = SCANNED / target.roller.sample.windows.count
+        target, now = target.some(worst.numpy()), now[:, worst]
+    else:
+        share = 1.0
     if scanning:
         size = (now[0] / target.weights[..., None].clamp_min(1e-9)).square().sum(-1).sqrt().numpy()
         origins = []
@@ -72,7 +79,7 @@ def starts(target: Target, trial: Trial, count: int, rng: np.random.Generator) -
         amplitudes = list(trial.amplitudes)
         z[amplitudes] = np.clip(origin[amplitudes] + np.clip(move, -3.0, 3.0), lower[amplitudes], upper[amplitudes])
         actual = z[amplitudes] - origin[amplitudes]
-        promise = -float(g @ actual + 0.5 * actual @ h @ actual)
+        promise = -share * float(g @ actual + 0.5 * actual @ h @ actual)
         if scanning and not np.abs(actual).max() > 1e-6:
             continue
         found.append(Start(z, promise))

@@ -1,0 +1,112 @@
+"""What the diagnosis starts from: samples of both sets, the twin made as good as it gets on the reference, weights."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from pred_core.diagnose.config import DiagnoseConfig
+from pred_core.diagnose.fit import Target, fit
+from pred_core.diagnose.judge import Bench, Tell
+from pred_core.diagnose.roll import Roller
+from pred_core.diagnose.sample import Sample, make_sample
+from pred_core.diagnose.trial import make_trial
+from pred_core.diagnose.weigh import misfit_of, seen_of, weigh
+from pred_core.effects import find_effect
+from pred_core.errors import DatasetError
+from pred_core.identify.space import Candidate
+from pred_core.twin import Twin
+from pred_core.types import Array, Episode
+
+BASE = ("stiffness", "ground_friction", "bending_stiffness")  # refined; axial damping does not show
+ROOM = 1.35  # times the substeps of the given twin that the refined one may need
+WORST = 0.25  # [m] mean error of a twin that is not this object's
+POLISH = 8  # steps of the base's refinement
+
+
+def base_fields(twin: Twin) -> tuple[str, ...]:
+    """Physics fields that act in this twin and may be refined."""
+    acts = {
+        "ground_friction": twin.scene.ground is not None or bool(twin.scene.fixtures),
+        "bending_stiffness": twin.physics.bending_stiffness > 0.0,
+    }
+    return tuple(f for f in BASE if acts.get(f, True))
+
+
+def commission(
+    twin: Twin, suspect: Sequence[Episode], reference: Sequence[Episode], config: DiagnoseConfig, tell: Tell
+) -> Bench:
+    """The bench. With a reference the base is refined on it and frozen; without one, on the suspect set's train
+    episodes, and every candidate refits it.
+
+    Raises: DatasetError if the twin does not describe the data at all.
+    """
+    sample = make_sample(suspect, twin, config.window)
+    known = make_sample(reference, twin, config.window) if reference else None
+    judged_on = known or sample
+    use = np.array([s == "train" for s in judged_on.splits]) if known is None else None
+    _check(Roller(twin, judged_on), judged_on, twin)
+    twin = _polish(twin, judged_on, use, config, tell)
+    roller = Roller(twin, judged_on)
+    as_it_is = Candidate(twin.physics, twin.extensions)
+    plain = weigh(roller, as_it_is, config.stride, None, config.seed)
+    errors = roller.errors([as_it_is], config.stride)[0]
+    misfit = misfit_of(errors, seen_of(roller, config.stride), plain)
+    if known is None:  # the suspect's own misfit holds what is looked for: only a part of it is taken as the model's
+        misfit = 0.25 * misfit
+    own = Roller(twin, sample)
+    target = Target(own, weigh(own, as_it_is, config.stride, misfit, config.seed), config.stride)
+    other = None
+    if known is not None:
+        other = Target(roller, weigh(roller, as_it_is, config.stride, misfit, config.seed), config.stride)
+    physics = () if known is not None else base_fields(twin)
+    train = np.flatnonzero(np.array([s == "train" for s in sample.splits]))
+    return Bench(twin, target, target.part(train.tolist()), twin, other, config, physics)
+
+
+def with_values(twin: Twin, candidate: Candidate) -> Twin:
+    """The twin at a point of a search."""
+    return twin.replace(physics=candidate.physics, extensions=_kept_evidence(twin, candidate))
+
+
+def _kept_evidence(twin: Twin, candidate: Candidate) -> tuple:  # type: ignore[type-arg]
+    known = {e.id: e.evidence for e in twin.extensions}
+    return tuple(dataclasses.replace(e, evidence=known.get(e.id, {})) for e in candidate.extensions)
+
+
+def _polish(twin: Twin, sample: Sample, use: Array | None, config: DiagnoseConfig, tell: Tell) -> Twin:
+    """The base and what it already carries, refined on the sample with the loss the candidates are judged by."""
+    chosen = np.ones(sample.episodes, dtype=bool) if use is None else use
+    most = ROOM * Roller(twin, sample).usual()
+    for step in range(2):  # the weights follow the parameters
+        roller = Roller(twin, sample)
+        target = Target(
+            roller, weigh(roller, Candidate(twin.physics, twin.extensions), config.stride, None, config.seed), config.stride
+        )
+        standing = tuple(find_effect(e.id) for e in twin.extensions)
+        narrow = tuple(e for e in standing if sum(q.size for q in e.parameters) <= 4)
+        trial = make_trial(twin, narrow, base_fields(twin))
+        before = target.losses(trial.space, [trial.space.start()])[0]
+        result = fit(target, trial.space, trial.space.start(), POLISH, chosen, most / roller.usual())
+        tell(f"base: loss {before[chosen].mean():.3f} -> {result.loss[chosen].mean():.3f}")
+        twin = with_values(twin, trial.space.candidate(result.z))
+        if result.loss[chosen].mean() > 0.97 * before[chosen].mean():
+            break
+    return twin
+
+
+def _check(roller: Roller, sample: Sample, twin: Twin) -> None:
+    """Raise DatasetError if the twin is far from the data from the beginning."""
+    errors = roller.errors([Candidate(twin.physics, twin.extensions)], 2)[0]
+    seen = seen_of(roller, 2)
+    per = sample.per_episode((errors.norm(dim=-1).sum((1, 2)) / seen.sum((1, 2)).clamp_min(1)).double().numpy())
+    worst = int(per.argmax())
+    if float(np.median(per)) > WORST:
+        raise DatasetError(
+            f"{sample.names[worst]}: the twin diverges or is not of this object",
+            got=f"a median error of {np.median(per):.2f} m after {len(roller.sample.windows.target) * twin.meta.period:.2g} s",
+            allowed=f"below {WORST} m",
+            next_step="Identify a twin from this data set or its reference first",
+        )

@@ -1,0 +1,261 @@
+"""One cause after the other: screen, fit, judge, name, extend, and look again at what is left."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pred_core.diagnose.commission import with_values
+from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals, set_limit, simplest
+from pred_core.diagnose.judge import Bench, Effects, Screened, Tell, judge, screen
+from pred_core.diagnose.trial import NOT_A_NAME, make_trial
+from pred_core.effects import LIBRARY, find_effect
+from pred_core.effects.effect import Effect
+from pred_core.identify.space import Candidate
+from pred_core.twin import Twin
+from pred_core.types import Array
+
+GATE_ONLY = ("gripper_offset", "gripper_rotation")  # absorbed by measured starts: the model-free gate names them
+WORTH = 0.02  # of the floor: what a candidate must promise to be fitted to the end
+LEFT = 0.25  # of the floor: an excess that is called unknown if nothing explains it
+SURE = 0.01  # p value of a lack of fit
+PAIRED = 5  # candidates whose pairs are tried
+STANDING = 0.05  # of the floor: a gain below is not worth a name, whatever its significance
+
+
+@dataclass(frozen=True)
+class Named:
+    """A cause that was accepted."""
+
+    judged: Judged
+    p_adjusted: float
+    group: tuple[str, ...]  # others that these data do not tell apart from it
+    closed: float  # share of the excess of its round that it closes
+    round: int
+
+
+@dataclass(frozen=True)
+class Round:
+    """What a round saw."""
+
+    base: Array  # (E,) losses before it
+    floor: float  # mean loss of the reference, or nothing
+    screened: tuple[tuple[str, float], ...]  # candidate, promise
+    judged: tuple[tuple[Judged, float, str], ...]  # candidate, adjusted p, why it was rejected ("" = accepted)
+
+
+@dataclass
+class Progress:
+    """State of a diagnosis between rounds."""
+
+    bench: Bench
+    named: list[Named] = field(default_factory=list)
+    rounds: list[Round] = field(default_factory=list)
+    unknown: bool = False
+    unknown_p: float = 1.0
+
+
+def candidates(bench: Bench, named: Sequence[str]) -> list[Effects]:
+    """Effects worth trying on this bench: those that can act and are not named yet."""
+    twin = bench.twin
+    cold = bench.reference is None
+    rows: list[Effects] = []
+    for effect in LIBRARY.values():
+        if set(effect.hooks) == {"observe"} or effect.id in NOT_A_NAME or effect.id in GATE_ONLY or effect.id in named:
+            continue
+        if "contact" in effect.hooks and twin.scene.ground is None:
+            continue
+        if {"bend", "bend_stiffness"} & set(effect.hooks) and not (
+            len(twin.body.bends) and twin.physics.bending_stiffness > 0.0
+        ):
+            continue
+        if cold and effect.id in _SAME_AS_BASE:
+            continue
+        rows.append((effect,))
+    return rows
+
+
+_SAME_AS_BASE = ("friction_scale", "bending_scale", "stretch_scale")
+
+
+def one_round(progress: Progress, tell: Tell, number: int) -> bool:
+    """Look for one more cause. Returns whether something was named."""
+    bench, config = progress.bench, progress.bench.config
+    rng = np.random.default_rng([config.seed, number])
+    base = bench.standing()
+    floor = float(_reference_losses(bench).mean()) if bench.reference is not None else 0.0
+    if number and not _something_left(progress, base, floor):
+        return False
+    named = [i for n in progress.named for i in n.judged.trial.ids]
+    options = candidates(bench, named)
+    screened = []
+    for n, effects in enumerate(options):
+        screened.append(screen(bench, effects, rng))
+        if n % 8 == 0:
+            tell(f"round {number + 1}: screening {n}/{len(options)}")
+    screened.sort(key=lambda s: -s.promise)
+    tell("round {}: most promising: {}".format(number + 1, ", ".join(s.trial.id for s in screened[:4])))
+    kept = _survivors(screened, config.survivors, WORTH * (floor or float(base.mean())))
+    judged: list[Judged] = []
+    for n, s in enumerate(kept):
+        judged.append(judge(bench, s)[0])
+        tell(f"round {number + 1}: fitted {n + 1}/{len(kept)}, {s.trial.id}: gain {judged[-1].mean:.3f} of {base.mean():.3f}")
+    excess = max(float(base.mean()) - floor, 0.0)
+    found, rows = _choose(judged, excess, floor, progress, tell)
+    closed = found.closed if found else 0.0
+    if found is None or closed < config.enough:
+        pair = _pairs(progress, kept, judged, base, floor, found, tell, number)
+        if pair is not None:
+            found = pair
+            rows = [*rows, (pair.judged, pair.p_adjusted, "")]
+    progress.rounds.append(
+        Round(base, floor, tuple((s.trial.id, s.promise) for s in screened), tuple(rows))
+    )
+    if found is None:
+        return False
+    progress.named.append(found)
+    progress.bench = extend(bench, found.judged)
+    return True
+
+
+def _something_left(progress: Progress, base: Array, floor: float) -> bool:
+    """Whether what is left after a name is worth another look."""
+    first = progress.rounds[0]
+    whole = float(first.base.mean()) - first.floor
+    return float(base.mean()) - floor > max(progress.bench.config.gate * whole, STANDING * floor)
+
+
+def finish(progress: Progress) -> None:
+    """Decide whether something is left that has no name."""
+    bench = progress.bench
+    if bench.reference is None:
+        return
+    suspect, reference = bench.standing(), _reference_losses(bench)
+    p = lack_of_fit(suspect, reference, bench.config.seed)
+    progress.unknown_p = p
+    progress.unknown = p < SURE and float(suspect.mean()) > (1.0 + LEFT) * float(reference.mean())
+
+
+def extend(bench: Bench, judged: Judged) -> Bench:
+    """Both twins with the cause in it: the suspect's as fitted, the reference's as it is without the change."""
+    space = judged.trial.space
+    null = np.array([k.coordinate(judged.null[k.name]) for k in space.knobs])
+    twin = with_values(bench.twin, space.candidate(judged.z))
+    changed = {e.id: e for e in space.candidate(null).extensions if e.id in judged.trial.ids}
+    kept = tuple(changed.pop(e.id, e) for e in bench.reference_twin.extensions) + tuple(changed.values())
+    reference = bench.reference_twin.replace(extensions=kept)
+    return dataclasses.replace(bench, twin=twin, reference_twin=reference, nulls={})
+
+
+def _reference_losses(bench: Bench) -> Array:
+    assert bench.reference is not None
+    space = make_trial(bench.reference_twin, (), ()).space
+    return bench.reference.losses(space, [space.start()])[0]
+
+
+def _survivors(screened: list[Screened], count: int, least: float) -> list[Screened]:
+    """The most promising ones, and the best of every family that promises anything."""
+    kept = [s for s in screened[:count] if s.promise > least]
+    families = {s.trial.family for s in kept}
+    for s in screened[count:]:
+        if s.trial.family not in families and s.promise > least:
+            kept.append(s)
+            families.add(s.trial.family)
+    return kept or screened[:2]
+
+
+def _choose(
+    judged: Sequence[Judged], excess: float, floor: float, progress: Progress, tell: Tell
+) -> tuple[Named | None, list[tuple[Judged, float, str]]]:
+    config = progress.bench.config
+    p = family_wise(judged, config.seed)
+    rows = [(j, float(q), _why_not(j, float(q), excess, floor, progress)) for j, q in zip(judged, p, strict=True)]
+    rows.sort(key=lambda row: -row[0].mean)
+    accepted = [row for row in rows if not row[2]]
+    if not accepted:
+        return None, rows
+    best = max(accepted, key=lambda row: row[0].mean)[0]
+    chosen = simplest([row[0] for row in accepted], best)
+    limit = set_limit(len(chosen.gain))
+    near = [o for o, z in rivals([r[0] for r in accepted], chosen) if o is not chosen and z < limit]
+    q = next(row[1] for row in accepted if row[0] is chosen)
+    closed = chosen.mean / excess if excess > 0 else 1.0
+    return Named(chosen, q, tuple(o.trial.id for o in near), closed, len(progress.rounds)), rows
+
+
+def _why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress) -> str:
+    config = progress.bench.config
+    cold = progress.bench.reference is None
+    first = progress.rounds[0] if progress.rounds else None
+    whole = excess if first is None else max(float(first.base.mean()) - first.floor, excess)
+    least = max((config.cold_gate if cold else config.gate) * whole, STANDING * floor)
+    better, acting = j.improved
+    if acting < 4:
+        return f"acts in {acting} episodes only"
+    if p > config.level:
+        return f"not significant (adjusted p {p:.3f})"
+    if j.mean < least:
+        return f"saves too little ({j.mean:.3f} of the loss, {least:.3f} needed)"
+    if better < config.improved * acting:
+        return f"{better} of {acting} episodes improve"
+    if not j.excludes_null:
+        return "its interval includes no change"
+    return ""
+
+
+def _pairs(
+    progress: Progress,
+    kept: Sequence[Screened],
+    judged: Sequence[Judged],
+    base: Array,
+    floor: float,
+    single: Named | None,
+    tell: Tell,
+    number: int,
+) -> Named | None:
+    """Two causes at once, where no single one explains enough: they can mask each other."""
+    bench, config = progress.bench, progress.bench.config
+    excess = float(base.mean()) - floor
+    if excess < LEFT * floor or number + 2 > config.causes:
+        return None
+    order = sorted(range(len(judged)), key=lambda n: -judged[n].mean)[:PAIRED]
+    best: Judged | None = None
+    alone = single.judged.mean if single else 0.0
+    tried: list[Judged] = []
+    for a, b in itertools.combinations(order, 2):
+        if judged[a].trial.family == judged[b].trial.family:
+            continue
+        if judged[a].mean + judged[b].mean < 0.6 * excess:
+            continue
+        effects: Effects = (*kept[a].effects, *kept[b].effects)
+        trial = bench.trial(effects)
+        begin = trial.space.start()
+        values = {**judged[a].values, **judged[b].values}
+        for n, k in enumerate(trial.space.knobs):
+            if k.name in values:
+                begin[n] = k.coordinate(values[k.name])
+        both = judge(bench, Screened(effects, trial, [], 0.0, trial.space.start()), [begin])[0]
+        tell(f"round {number + 1}: pair {both.trial.id}: gain {both.mean:.3f}")
+        tried.append(both)
+        if best is None or both.mean > best.mean:
+            best = both
+    if best is None or best.mean < max(config.enough * excess, alone + 0.15 * excess):
+        return None
+    p = float(family_wise(tried, config.seed)[[t is best for t in tried].index(True)])
+    if p > config.level:
+        return None
+    return Named(best, p, (), best.mean / excess, number)
+
+
+def effect_of(id: str) -> type[Effect]:
+    """The effect with this id."""
+    return find_effect(id)
+
+
+def with_candidate(twin: Twin, candidate: Candidate) -> Twin:
+    """The twin at a candidate's values."""
+    return with_values(twin, candidate)
