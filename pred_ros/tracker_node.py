@@ -125,6 +125,7 @@ class TrackerNode(Shell):
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
         self._refused = ""
         self._status = "searching"
+        self._odd: tuple[str, float] | None = None
         self._stopping = False
 
     def setup(self) -> None:
@@ -194,6 +195,9 @@ class TrackerNode(Shell):
             self.report(ERROR, f"no pictures of {', '.join(silent)}: nothing is tracked")
         elif self._status != "tracking":
             self.report(WARN, f"{self._status}: the object is not in view, or is not a {self.config.kind}")
+        elif self._odd is not None:
+            camera, off = self._odd
+            self.report(WARN, f"{camera} sees the object {1e3 * off:.0f} mm off: has it been moved? Calibrate it anew")
         elif silent:
             self.report(WARN, f"tracking without {', '.join(silent)}: no pictures")
         else:
@@ -282,6 +286,7 @@ class TrackerNode(Shell):
         t = estimate.tracks
         frame = PointFrame(int(t.stamp), t.position, t.id, t.confidence, None)
         self._out.publish(convert.points_to_cloud(frame))
+        self._odd = estimate.odd_camera()
         self.diagnostics.count("estimates")
         self.diagnostics.value("residual [mm]", f"{1e3 * estimate.residual:.2f}")
         self.diagnostics.value("particles in view", f"{int(t.visible.sum())} of {len(t.id)}")

@@ -231,6 +231,23 @@ def test_slipped_rope_is_let_go(tracker: Tracker, scene: HangingRope) -> None:
     assert np.linalg.norm(estimate.tracks.position - scene.truth(26), axis=-1).mean() < 0.008
 
 
+def test_a_moved_camera_is_named_and_outvoted(tracker: Tracker, scene: HangingRope) -> None:
+    for k in range(6):
+        stamp = START + k * STEP
+        tracker.add_grip(**scene.grip(stamp))
+        for name, frame in scene.frames(stamp).items():
+            pose = frame.world_from_camera.copy()
+            if name == "cam1" and k >= 3:  # believed to be where it is not: about 1 degree at 1 m
+                pose[:3, 3] += 0.017 * pose[:3, 0]
+            tracker.add_frame(name, dataclasses.replace(frame, world_from_camera=pose))
+        estimate = tracker.step()
+        assert estimate is not None
+        assert (estimate.odd_camera() is not None) == (k >= 3)
+    odd = estimate.odd_camera()
+    assert odd is not None and odd[0] == "cam1" and 0.008 < odd[1] < 0.02
+    assert np.linalg.norm(estimate.tracks.position - scene.truth(26), axis=-1).mean() < 0.008
+
+
 def test_nothing_to_see_is_no_estimate(scene: HangingRope) -> None:
     empty = dataclasses.replace(CONFIG, workspace=Workspace((0.3, 0.3, 0.0), (0.5, 0.5, 0.5)))
     tracker = Tracker(empty, ["cam0"])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pred_core.types import Array, Tracks
 
+ODD_FACTOR, ODD_LEAST = 1.6, 0.004  # times the others' distance, [m]
 Status = Literal["searching", "tracking", "lost"]
 
 
@@ -23,6 +24,12 @@ class Estimate:
     status: Status
     residual: float  # [m] root mean square distance of the points that were used
     cameras: tuple[str, ...]  # whose pictures went in
+    off: tuple[float, ...] = ()  # [m] median distance between the object and what each of them sees of it
+
+    def odd_camera(self) -> tuple[str, float] | None:
+        """The camera that sees the object elsewhere than the others do, and by how much [m]: it has been moved."""
+        odd = odd_one(np.array(self.off))
+        return None if odd is None else (self.cameras[odd], self.off[odd])
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,16 @@ class Prior:
     position: Array  # (P, 3) [m] world
     velocity: Array  # (P, 3) [m/s]
     sigma: float  # [m] standard deviation of a coordinate
+
+
+def odd_one(off: Array) -> int | None:
+    """The camera whose distance (V,) [m] from the object stands out. Of two, nobody knows which one is wrong."""
+    known = np.flatnonzero(np.isfinite(off))
+    if len(known) < 3:
+        return None
+    worst = int(known[np.argmax(off[known])])
+    rest = float(np.median(off[known[known != worst]]))
+    return worst if off[worst] > max(ODD_FACTOR * rest, ODD_LEAST) else None
 
 
 def trace_confidence(covariance: Array, visible: NDArray[np.bool_], scale: float = 0.01) -> NDArray[np.float32]:

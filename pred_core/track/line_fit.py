@@ -60,6 +60,7 @@ class LineFit:
     covariance: Array  # (N, 3, 3) [m^2]
     support: Array  # (N,) weight of the points at a node
     views: Array  # (V, N) the same per camera
+    off: Array  # (V,) [m] median distance of the points of each camera; NaN where it has none
     residual: float  # [m] root mean square distance of accepted points
     explained: float  # share of the points that were accepted
 
@@ -93,6 +94,7 @@ def fit_line(
         covariance=system.covariance(),
         support=support.sum(axis=0),
         views=support,
+        off=_view_medians(matched.distance, cloud),
         residual=float(np.sqrt((weight * matched.distance**2).sum() / total)) if total > 0 else float("nan"),
         explained=float((weight > 0.1).mean()) if len(weight) else 0.0,
     )
@@ -138,6 +140,25 @@ def _match(nodes: Array, cloud: Cloud, radius: float, velocity: Array | None) ->
     across = points - nodes[chosen] - where[:, None] * unit[chosen]
     distance = np.sqrt(np.einsum("ma,ma->m", across, across) + past**2)
     return _Matched(points, chosen, share, past, unit[chosen], distance)
+
+
+def without_view(cloud: Cloud, view: int) -> Cloud:
+    """The cloud of the other cameras."""
+    keep = cloud.view != view
+    return Cloud(cloud.points[keep], cloud.rays[keep], cloud.depth[keep], cloud.view[keep], cloud.age[keep])
+
+
+def view_distances(nodes: Array, cloud: Cloud, radius: float, velocity: Array | None) -> Array:
+    """Median distance (V,) [m] of each camera's points from a line (N, 3); NaN for a camera without points."""
+    return _view_medians(_match(nodes, cloud, radius, velocity).distance, cloud)
+
+
+def _view_medians(distance: Array, cloud: Cloud) -> Array:
+    count = int(cloud.view.max()) + 1 if len(cloud.view) else 0
+    found = np.full(count, np.nan)
+    for view in np.unique(cloud.view).astype(int):
+        found[view] = np.median(distance[cloud.view == view])
+    return found
 
 
 def _robust(distance: Array, gate: float) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,9 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pred_core.config import setting
-from pred_core.track.estimate import Estimate, Prior, Status, trace_confidence
+from pred_core.track.estimate import Estimate, Prior, Status, odd_one, trace_confidence
 from pred_core.track.grasp import Grasp, GraspConfig
-from pred_core.track.line_fit import SURFACE, Anchors, Cloud, LineFit, LineFitConfig, fit_line
+from pred_core.track.line_fit import (
+    SURFACE,
+    Anchors,
+    Cloud,
+    LineFit,
+    LineFitConfig,
+    fit_line,
+    view_distances,
+    without_view,
+)
 from pred_core.track.line_start import FoundLine, LineStartConfig, find_line, resample
 from pred_core.track.view import View
 from pred_core.types import Array, Tracks
@@ -96,6 +106,7 @@ class LineTracker:
     ) -> Estimate:
         """Follow the line to `stamp` [ns]. `prior` is used instead of constant velocity."""
         assert self.nodes is not None  # `start` has succeeded; the caller's bug otherwise
+        cameras = tuple(v.camera for v in views)
         dt = max((stamp - self.stamp) * 1e-9, 0.0)
         expected, sigma = self._predict(dt, stamp, poses, prior)
         information = np.eye(3) / (sigma**2)[:, None, None]
@@ -106,16 +117,22 @@ class LineTracker:
         information[held] = np.eye(3) / self.config.grasp.sigma**2
         expected[held] = place
         cloud = self._cloud([_near(v, expected, self.config.fit.reach) for v in views], stamp, self.radius)
-        fit = fit_line(
-            expected, self.spacing, cloud, self.radius, self.config.fit, Anchors(expected, information), self.velocity
-        )
+        anchors = Anchors(expected, information)
+        fit = fit_line(expected, self.spacing, cloud, self.radius, self.config.fit, anchors, self.velocity)
+        odd = odd_one(fit.off)
+        if odd is not None:  # a camera that has been moved pulls at the line: the others decide
+            rest = without_view(cloud, odd)
+            fit = fit_line(expected, self.spacing, rest, self.radius, self.config.fit, anchors, self.velocity)
+            off = view_distances(fit.nodes, cloud, self.radius, self.velocity)
+            fit = dataclasses.replace(fit, off=off)
+            views = [v for k, v in enumerate(views) if k != odd]
         score = fit.explained - _contradicted(views, fit)
         if score < self.config.doubt:
             fit = self._second_opinion(fit, score, views, stamp, poses)
         visible = fit.views.max(axis=0, initial=0.0) >= self.config.seen
         self._advance(fit, dt, visible, sigma)
         self.stamp = stamp
-        return self._estimate(fit, visible, self._judge(fit, views, stamp), tuple(v.camera for v in views))
+        return self._estimate(fit, visible, self._judge(fit, views, stamp), cameras)
 
     def _ends_in_tools(self, nodes: Array, poses: Poses | None, closed: NDArray[np.bool_]) -> Anchors:
         """A held end is in the tool centre, which the jaws hide."""
@@ -180,7 +197,8 @@ class LineTracker:
         count = self.config.particles
         confidence = trace_confidence(fit.covariance, visible)
         tracks = Tracks(np.int64(self.stamp), fit.nodes.copy(), np.arange(count, dtype=np.uint32), visible, confidence)  # type: ignore[arg-type]
-        return Estimate(tracks, fit.covariance, self.velocity.copy(), status, fit.residual, cameras)
+        off = tuple(fit.off.tolist())
+        return Estimate(tracks, fit.covariance, self.velocity.copy(), status, fit.residual, cameras, off)
 
     def _cloud(self, views: Sequence[View], stamp: int, radius: float) -> Cloud:
         """At most `points` of each view, moved from the surface onto the centreline."""
