@@ -102,9 +102,7 @@ def cloth_shots(seconds: float, seed: int) -> Iterator[Shot]:
                 yield _shot(cameras, cloth.data, cloth.time, generator, cloth.vertices, None)
 
 
-def _shot(
-    cameras: Cameras, data: Any, at: float, generator: np.random.Generator, truth: Array, grip: Any
-) -> Shot:
+def _shot(cameras: Cameras, data: Any, at: float, generator: np.random.Generator, truth: Array, grip: Any) -> Shot:
     stamp = 1_000_000_000 + round(1e9 * at)
     frames = {n: cameras.frame(data, n, stamp, generator) for n in cameras.configs}
     return Shot(at, frames, {n: cameras.truth(data, n)[1] for n in cameras.configs}, truth, grip)

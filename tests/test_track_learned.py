@@ -74,12 +74,13 @@ def test_tapnext_swaps_its_axes_and_keeps_its_state() -> None:
 
 def test_small_random_sam2_follows_a_box(tmp_path: Path) -> None:
     transformers = pytest.importorskip("transformers", reason="transformers is not installed")
+    pytest.importorskip("torchvision", reason="the processors of SAM 2 need torchvision")
     if "Sam2VideoModel" not in dir(transformers):
         pytest.skip("this transformers has no SAM 2")
     config = transformers.Sam2VideoConfig()
     transformers.Sam2VideoModel(config).save_pretrained(tmp_path)
     transformers.Sam2VideoProcessor(
-        image_processor=transformers.Sam2ImageProcessorFast(), video_processor=transformers.Sam2VideoVideoProcessor()
+        image_processor=transformers.Sam2ImageProcessor(), video_processor=transformers.Sam2VideoVideoProcessor()
     ).save_pretrained(tmp_path)
     follower = MaskFollower(tmp_path)
     assert follower.start(RGB, np.array([4.0, 4.0, 20.0, 20.0])).shape == RGB.shape[:2]

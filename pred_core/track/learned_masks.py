@@ -30,11 +30,14 @@ def check_weights(folder: Path, model: str) -> None:
 
 
 def transformers_module(model: str) -> Any:
-    """The transformers package. Raises: ConfigError if it is not installed."""
+    """The transformers package. Raises: ConfigError if it, or the torchvision its processors need, is missing."""
     try:
+        import torchvision  # noqa: F401
         import transformers
     except ImportError as error:
-        raise ConfigError(f"{model} needs the transformers package", next_step="pip install transformers") from error
+        raise ConfigError(
+            f"{model} needs transformers and torchvision", got=error, next_step="pip install transformers torchvision"
+        ) from error
     return transformers
 
 
