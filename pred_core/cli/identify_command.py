@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import shlex
 import sys
 import time
 from pathlib import Path
-from typing import Any, get_type_hints
 
 from pred_core.bag.dataset import load_dataset
-from pred_core.config import from_mapping
+from pred_core.cli.settings import add_settings, given_settings, read_settings
 from pred_core.identify.config import PAPER, IdentifyConfig
 from pred_core.identify.report import DEFINITIONS, flags, write_report
 from pred_core.identify.run import identify, train_episodes
@@ -33,15 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     text = "twin identified with fewer effects, kept inside as the spring-mass to compare with"
     parser.add_argument("--base", type=Path, metavar="TWIN", help=text)
     parser.add_argument("--paper", action="store_true", help="search the paper's five parameters alone")
-    hints = get_type_hints(IdentifyConfig)
-    for field in dataclasses.fields(IdentifyConfig):
-        flag = "--" + field.name.replace("_", "-")
-        default = f"{_shown(field.default)} {field.metadata['unit']}".strip()
-        text = f"{field.metadata['doc']} (default: {default})".replace("%", "%%")
-        if hints[field.name] is bool:
-            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=None, help=text)
-        else:
-            parser.add_argument(flag, default=None, metavar="VALUE", help=text)
+    add_settings(parser, IdentifyConfig)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -106,13 +96,9 @@ class _Progress:
 
 def _config(args: argparse.Namespace) -> IdentifyConfig:
     """The configuration the flags describe. Raises: ConfigError naming the flag."""
-    hints = get_type_hints(IdentifyConfig)
-    values: dict[str, Any] = {"parameters": PAPER} if args.paper else {}
-    for field in dataclasses.fields(IdentifyConfig):
-        given = getattr(args, field.name)
-        if given is not None:
-            values[field.name] = given if isinstance(given, bool) else _parsed(given, hints[field.name])
-    return from_mapping(IdentifyConfig, values, "pred identify")
+    values = {"parameters": PAPER} if args.paper else {}
+    config: IdentifyConfig = read_settings(args, IdentifyConfig, "pred identify", values)
+    return config
 
 
 def _check_names(config: IdentifyConfig) -> None:
@@ -120,36 +106,7 @@ def _check_names(config: IdentifyConfig) -> None:
     search_space(Physics(), config.parameters, config.effects)
 
 
-def _parsed(text: str, hint: Any) -> Any:
-    """A flag's text as the number or list it stands for; what does not parse is left for the strict check."""
-    if hint == tuple[str, ...]:
-        return tuple(part for part in text.split(",") if part)
-    if hint == tuple[float, ...]:
-        return tuple(_number(part) for part in text.split(",") if part)
-    return _number(text)
-
-
-def _number(text: str) -> Any:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
-
-
-def _shown(value: Any) -> str:
-    return ",".join(str(v) for v in value) if isinstance(value, tuple) else str(value)
-
-
 def _given(args: argparse.Namespace) -> list[str]:
     flags = ["--paper"] if args.paper else []
     flags += ["--base", str(args.base)] if args.base is not None else []
-    for field in dataclasses.fields(IdentifyConfig):
-        given = getattr(args, field.name)
-        flag = "--" + field.name.replace("_", "-")
-        if isinstance(given, bool):
-            flags.append(flag if given else flag.replace("--", "--no-", 1))
-        elif given is not None:
-            flags += [flag, str(given)]
-    return flags
+    return [*flags, *given_settings(args, IdentifyConfig)]

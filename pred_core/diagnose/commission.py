@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.fit import Target, fit
+from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Bench, Tell
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.sample import Sample, make_sample
@@ -18,7 +20,7 @@ from pred_core.effects import find_effect
 from pred_core.errors import DatasetError
 from pred_core.identify.space import Candidate
 from pred_core.twin import Twin
-from pred_core.types import Array, Episode
+from pred_core.types import Array, Episode, Physics
 
 BASE = ("stiffness", "ground_friction", "bending_stiffness")  # refined; axial damping does not show
 ROOM = 1.35  # times the substeps of the given twin that the refined one may need
@@ -36,7 +38,12 @@ def base_fields(twin: Twin) -> tuple[str, ...]:
 
 
 def commission(
-    twin: Twin, suspect: Sequence[Episode], reference: Sequence[Episode], config: DiagnoseConfig, tell: Tell
+    twin: Twin,
+    suspect: Sequence[Episode],
+    reference: Sequence[Episode],
+    config: DiagnoseConfig,
+    tell: Tell,
+    journal: Journal,
 ) -> Bench:
     """The bench. With a reference the base is refined on it and frozen; without one, on the suspect set's train
     episodes, and every candidate refits it.
@@ -48,7 +55,7 @@ def commission(
     judged_on = known or sample
     use = np.array([s == "train" for s in judged_on.splits]) if known is None else None
     _check(Roller(twin, judged_on), judged_on, twin)
-    twin = _polish(twin, judged_on, use, config, tell)
+    twin = _stored(twin, journal.once("base", lambda: _plain(_polish(twin, judged_on, use, config, tell))))
     roller = Roller(twin, judged_on)
     as_it_is = Candidate(twin.physics, twin.extensions)
     plain = weigh(roller, as_it_is, config.stride, None, config.seed)
@@ -76,15 +83,30 @@ def _kept_evidence(twin: Twin, candidate: Candidate) -> tuple:  # type: ignore[t
     return tuple(dataclasses.replace(e, evidence=known.get(e.id, {})) for e in candidate.extensions)
 
 
+def _plain(twin: Twin) -> dict[str, Any]:
+    """The values of a base that a refinement may change."""
+    return {
+        "physics": dataclasses.asdict(twin.physics),
+        "extensions": [{k: list(v) for k, v in e.parameters.items()} for e in twin.extensions],
+    }
+
+
+def _stored(twin: Twin, values: dict[str, Any]) -> Twin:
+    extensions = tuple(
+        dataclasses.replace(e, parameters={k: tuple(v) for k, v in found.items()})
+        for e, found in zip(twin.extensions, values["extensions"], strict=True)
+    )
+    return twin.replace(physics=Physics(**values["physics"]), extensions=extensions)
+
+
 def _polish(twin: Twin, sample: Sample, use: Array | None, config: DiagnoseConfig, tell: Tell) -> Twin:
     """The base and what it already carries, refined on the sample with the loss the candidates are judged by."""
     chosen = np.ones(sample.episodes, dtype=bool) if use is None else use
     most = ROOM * Roller(twin, sample).usual()
-    for step in range(2):  # the weights follow the parameters
+    for _ in range(2):  # the weights follow the parameters
         roller = Roller(twin, sample)
-        target = Target(
-            roller, weigh(roller, Candidate(twin.physics, twin.extensions), config.stride, None, config.seed), config.stride
-        )
+        weights = weigh(roller, Candidate(twin.physics, twin.extensions), config.stride, None, config.seed)
+        target = Target(roller, weights, config.stride)
         standing = tuple(find_effect(e.id) for e in twin.extensions)
         narrow = tuple(e for e in standing if sum(q.size for q in e.parameters) <= 4)
         trial = make_trial(twin, narrow, base_fields(twin))
@@ -106,7 +128,7 @@ def _check(roller: Roller, sample: Sample, twin: Twin) -> None:
     if float(np.median(per)) > WORST:
         raise DatasetError(
             f"{sample.names[worst]}: the twin diverges or is not of this object",
-            got=f"a median error of {np.median(per):.2f} m after {len(roller.sample.windows.target) * twin.meta.period:.2g} s",
+            got=f"a median error of {np.median(per):.2f} m",
             allowed=f"below {WORST} m",
             next_step="Identify a twin from this data set or its reference first",
         )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,13 +11,15 @@ from numpy.typing import NDArray
 
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import ACTS, Judged
-from pred_core.diagnose.fit import Fit, Target, fit, rho, without_groups
+from pred_core.diagnose.fit import Target, fit, rho, without_groups
+from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.search import Start, refine_trial, starts
 from pred_core.diagnose.trial import Trial, make_trial, scanned
 from pred_core.effects.effect import Effect
 from pred_core.twin import Twin
 from pred_core.types import Array
 
+KEPT_STARTS = 4
 NULL_STEPS = 4  # of a candidate's refinement on the reference
 Tell = Callable[[str], None]
 Effects = tuple[type[Effect], ...]
@@ -61,10 +64,20 @@ class Screened:
     null: Array  # coordinates (in the suspect set's space) of no change
 
 
-def screen(bench: Bench, effects: Effects, rng: np.random.Generator) -> Screened:
-    """Where to start a candidate, and how much it promises beyond what the reference already gives it."""
+def rng_of(seed: int, key: str) -> np.random.Generator:
+    """A generator of its own for every piece, so that pieces do not depend on which ran before."""
+    return np.random.default_rng([seed, zlib.crc32(key.encode())])
+
+
+def screen(bench: Bench, effects: Effects, rng: np.random.Generator, journal: Journal, key: str) -> Screened:
+    """Where to start a candidate, and how much it promises."""
     trial = bench.trial(effects)
-    found = starts(bench.fitted, trial, bench.config.places, rng)
+
+    def find() -> list[list[object]]:
+        found = starts(bench.fitted, trial, bench.config.places, rng)[:KEPT_STARTS]
+        return [[s.z.tolist(), s.promise] for s in found]
+
+    found = [Start(np.array(z), float(p)) for z, p in journal.once(key, find)]
     return Screened(effects, trial, found, found[0].promise, trial.space.start())
 
 
@@ -89,38 +102,46 @@ def null_of(bench: Bench, screened: Screened) -> Array:
     return null
 
 
-def judge(bench: Bench, screened: Screened, begin: Sequence[Array] = ()) -> tuple[Judged, Fit]:
+def judge(bench: Bench, screened: Screened, journal: Journal, key: str) -> Judged:
     """Fit on the train episodes, cross-fit by recordings, compare with no change on every episode."""
+    values = journal.once(key, lambda: _judge(bench, screened))
+    trial, space = screened.trial, screened.trial.space
+    z = np.array(values["z"])
+    return Judged(
+        trial=trial,
+        values=space.values(z),
+        null=space.values(np.array(values["null"])),
+        intervals=_intervals(trial, z, np.array(values["left_out"])),
+        gain=np.array(values["gain"]),
+        acts=np.array(values["moved"]) > ACTS,
+        extended=np.array(values["extended"]),
+        z=z,
+    )
+
+
+def _judge(bench: Bench, screened: Screened) -> dict[str, object]:
+    """Plain values of a candidate: coordinates, those without each recording, gains and losses per episode."""
     trial, space, target = screened.trial, screened.trial.space, bench.target
     train = bench.train
-    found = [Start(z, 0.0) for z in begin] or screened.starts
-    result = refine_trial(bench.fitted, trial, found, bench.config.iterations)
+    result = refine_trial(bench.fitted, trial, screened.starts, bench.config.iterations)
     null = null_of(bench, screened)
     sample = target.roller.sample
     left_out = without_groups(result, space, sample.groups[train])
-    points = [null, result.z, *left_out.values()]
-    u = target.residuals(space, points)
+    u = target.residuals(space, [null, result.z, *left_out.values()])
     losses = target.per_episode(rho(u))
     extended = losses[1].copy()
     for row, group in enumerate(left_out):
         mine = train & (sample.groups == group)
         extended[mine] = losses[2 + row][mine]
     moved = np.sqrt(np.maximum(target.per_episode((u[1] - u[0]).square()[None])[0], 0.0))
-    spread = np.array(list(left_out.values())) if left_out else result.z[None]
-    values, nulls = space.values(result.z), space.values(null)
-    return (
-        Judged(
-            trial=trial,
-            values=values,
-            null=nulls,
-            intervals=_intervals(trial, result.z, spread),
-            gain=losses[0] - extended,
-            acts=moved > ACTS,
-            extended=extended,
-            z=result.z,
-        ),
-        result,
-    )
+    return {
+        "z": result.z.tolist(),
+        "null": null.tolist(),
+        "left_out": [p.tolist() for p in left_out.values()] or [result.z.tolist()],
+        "gain": (losses[0] - extended).tolist(),
+        "extended": extended.tolist(),
+        "moved": moved.tolist(),
+    }
 
 
 def _intervals(trial: Trial, z: Array, left_out: Array) -> dict[str, tuple[float, float]]:

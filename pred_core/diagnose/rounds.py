@@ -11,12 +11,11 @@ import numpy as np
 
 from pred_core.diagnose.commission import with_values
 from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals, set_limit, simplest
-from pred_core.diagnose.judge import Bench, Effects, Screened, Tell, judge, screen
+from pred_core.diagnose.journal import Journal
+from pred_core.diagnose.judge import Bench, Effects, Screened, Tell, judge, rng_of, screen
+from pred_core.diagnose.search import Start
 from pred_core.diagnose.trial import NOT_A_NAME, make_trial
-from pred_core.effects import LIBRARY, find_effect
-from pred_core.effects.effect import Effect
-from pred_core.identify.space import Candidate
-from pred_core.twin import Twin
+from pred_core.effects import LIBRARY
 from pred_core.types import Array
 
 GATE_ONLY = ("gripper_offset", "gripper_rotation")  # absorbed by measured starts: the model-free gate names them
@@ -53,6 +52,7 @@ class Progress:
     """State of a diagnosis between rounds."""
 
     bench: Bench
+    journal: Journal
     named: list[Named] = field(default_factory=list)
     rounds: list[Round] = field(default_factory=list)
     unknown: bool = False
@@ -85,7 +85,6 @@ _SAME_AS_BASE = ("friction_scale", "bending_scale", "stretch_scale")
 def one_round(progress: Progress, tell: Tell, number: int) -> bool:
     """Look for one more cause. Returns whether something was named."""
     bench, config = progress.bench, progress.bench.config
-    rng = np.random.default_rng([config.seed, number])
     base = bench.standing()
     floor = float(_reference_losses(bench).mean()) if bench.reference is not None else 0.0
     if number and not _something_left(progress, base, floor):
@@ -94,7 +93,8 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
     options = candidates(bench, named)
     screened = []
     for n, effects in enumerate(options):
-        screened.append(screen(bench, effects, rng))
+        key = f"{number}/screen/{'+'.join(e.id for e in effects)}"
+        screened.append(screen(bench, effects, rng_of(config.seed, key), progress.journal, key))
         if n % 8 == 0:
             tell(f"round {number + 1}: screening {n}/{len(options)}")
     screened.sort(key=lambda s: -s.promise)
@@ -102,8 +102,9 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
     kept = _survivors(screened, config.survivors, WORTH * (floor or float(base.mean())))
     judged: list[Judged] = []
     for n, s in enumerate(kept):
-        judged.append(judge(bench, s)[0])
-        tell(f"round {number + 1}: fitted {n + 1}/{len(kept)}, {s.trial.id}: gain {judged[-1].mean:.3f} of {base.mean():.3f}")
+        judged.append(judge(bench, s, progress.journal, f"{number}/fit/{s.trial.id}"))
+        gain = f"gain {judged[-1].mean:.3f} of {base.mean():.3f}"
+        tell(f"round {number + 1}: fitted {n + 1}/{len(kept)}, {s.trial.id}: {gain}")
     excess = max(float(base.mean()) - floor, 0.0)
     found, rows = _choose(judged, excess, floor, progress, tell)
     closed = found.closed if found else 0.0
@@ -238,7 +239,8 @@ def _pairs(
         for n, k in enumerate(trial.space.knobs):
             if k.name in values:
                 begin[n] = k.coordinate(values[k.name])
-        both = judge(bench, Screened(effects, trial, [], 0.0, trial.space.start()), [begin])[0]
+        screened = Screened(effects, trial, [Start(begin, 0.0)], 0.0, trial.space.start())
+        both = judge(bench, screened, progress.journal, f"{number}/pair/{trial.id}")
         tell(f"round {number + 1}: pair {both.trial.id}: gain {both.mean:.3f}")
         tried.append(both)
         if best is None or both.mean > best.mean:
@@ -249,13 +251,3 @@ def _pairs(
     if p > config.level:
         return None
     return Named(best, p, (), best.mean / excess, number)
-
-
-def effect_of(id: str) -> type[Effect]:
-    """The effect with this id."""
-    return find_effect(id)
-
-
-def with_candidate(twin: Twin, candidate: Candidate) -> Twin:
-    """The twin at a candidate's values."""
-    return with_values(twin, candidate)

@@ -32,7 +32,8 @@ def weigh(roller: Roller, candidate: Candidate, stride: int, misfit: Tensor | No
     base = roller.errors([candidate], stride)[0]
     spread = torch.zeros(base.shape[:-1])
     for _ in range(DRAWS):
-        draw = [torch.randn(w.start.position.shape, generator=generator) * free * START * sample.noise for _ in range(2)]
+        shape, size = w.start.position.shape, free * START * sample.noise
+        draw = [torch.randn(shape, generator=generator) * size for _ in range(2)]
         start = w.start.replace(
             position=w.start.position + draw[0], velocity=w.start.velocity + draw[1] / roller.twin.meta.period * 0.3
         )
@@ -41,7 +42,8 @@ def weigh(roller: Roller, candidate: Candidate, stride: int, misfit: Tensor | No
         spread += (shaken - base).square().mean(dim=-1) / DRAWS
     variance = sample.noise**2 + CHAOS * spread
     if misfit is not None:
-        variance = variance + misfit[None, :, None]
+        frames = torch.arange(variance.shape[1]).clamp_max(len(misfit) - 1)
+        variance = variance + misfit[frames][None, :, None]
     return variance.rsqrt()
 
 

@@ -1,0 +1,81 @@
+"""`pred diagnose`: what a twin gets wrong on measured data, and a twin that has it; diagnosis.json and report.html."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import shlex
+import sys
+import time
+from pathlib import Path
+
+from pred_core.bag.dataset import Dataset, load_dataset
+from pred_core.cli.checks import warn_of_another_object
+from pred_core.cli.settings import add_settings, given_settings, read_settings
+from pred_core.diagnose.config import DiagnoseConfig
+from pred_core.diagnose.journal import Journal
+from pred_core.diagnose.report import write_report
+from pred_core.diagnose.run import diagnose
+from pred_core.evaluate.report import write_json
+from pred_core.twin import Twin
+
+NAME = "diagnose"
+HELP = "find what a twin's simulation gets wrong, name the cause, extend the twin and measure the gain"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("dataset", type=Path, help="data set folder")
+    parser.add_argument("--twin", type=Path, required=True, help="twin directory that is questioned")
+    parser.add_argument("--reference", type=Path, default=None, metavar="DATASET",
+                        help="data set of the same object without the effect: the change is diagnosed")
+    parser.add_argument("--out", type=Path, required=True, help="output folder; an interrupted run goes on there")
+    add_settings(parser, DiagnoseConfig)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Exit code 0 whatever the outcome; raises PredError for bad input."""
+    begin = time.monotonic()
+    config: DiagnoseConfig = read_settings(args, DiagnoseConfig, "pred diagnose")
+    dataset = load_dataset(args.dataset)
+    twin = Twin.load(args.twin)
+    warn_of_another_object(twin, dataset, str(args.twin))
+    reference = None if args.reference is None else load_dataset(args.reference)
+    journal = Journal(args.out / "journal.jsonl", _header(dataset, reference, twin, config))
+    tell = _Progress(begin)
+    episodes = list(dataset.episodes())
+    known = None if reference is None else list(reference.episodes())
+    answer = diagnose(episodes, twin, known, config, tell, journal=journal, begin=begin)
+    command = "pred " + shlex.join(_words(args))
+    meta = dataclasses.replace(answer.twin.meta, created_by=command)
+    answer.twin.replace(meta=meta).save(args.out / "twin")
+    write_json(args.out / "diagnosis.json", {**answer.to_json(), "command": command})
+    write_report(args.out / "report.html", answer, episodes, known, command)
+    print(answer.sentence)
+    for row in answer.ranking[:5]:
+        print(f"  {row.probability:5.2f}  {row.id:24s} {row.rejected}")
+    print(f"{args.out / 'report.html'}  {args.out / 'diagnosis.json'}  {args.out / 'twin'}  ({answer.seconds:.0f} s)")
+    return 0
+
+
+def _header(dataset: Dataset, reference: Dataset | None, twin: Twin, config: DiagnoseConfig) -> dict[str, object]:
+    sets = [dataset] if reference is None else [dataset, reference]
+    hashes = [[s.sha256(e) + e.split for e in s.entries] for s in sets]
+    return {"data": hashes, "twin": twin.digest(), "config": repr(config), "version": 1}
+
+
+def _words(args: argparse.Namespace) -> list[str]:
+    words = ["diagnose", str(args.dataset), "--twin", str(args.twin), "--out", str(args.out)]
+    if args.reference is not None:
+        words += ["--reference", str(args.reference)]
+    return [*words, *given_settings(args, DiagnoseConfig)]
+
+
+class _Progress:
+    """Lines on stderr with the time passed."""
+
+    def __init__(self, begin: float):
+        self.begin = begin
+
+    def __call__(self, text: str) -> None:
+        print(f"[{time.monotonic() - self.begin:5.0f} s] {text}", file=sys.stderr)

@@ -1,0 +1,144 @@
+"""What a diagnosis says: for people, for `diagnosis.json`, for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pred_core.diagnose.errors import EpisodeErrors, Gain
+from pred_core.diagnose.gate import GateResult
+from pred_core.diagnose.rounds import Round
+from pred_core.twin import Twin
+
+OUTCOMES = ("none", "named", "group", "unknown")
+
+
+@dataclass(frozen=True)
+class Value:
+    """A parameter of a cause."""
+
+    value: float
+    unit: str
+    low: float  # 90 % interval
+    high: float
+    at_bound: bool = False
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One named cause."""
+
+    id: str
+    family: str
+    probability: float
+    parameters: Mapping[str, Value]
+    measured: bool = False  # found by the model-free gate, corrected where data enter
+    closed: float = 0.0  # share of the excess error of its round that it closes
+    p_adjusted: float = 1.0
+    group: tuple[str, ...] = ()  # these data do not tell it apart from
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """One line of the ranking."""
+
+    id: str
+    family: str
+    probability: float
+    gain: float  # share of the excess loss it saves on held-out episodes
+    p_adjusted: float
+    rejected: str  # why it is not named; "" = it is
+    values: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Whole held-out episodes of one split."""
+
+    split: str
+    base: EpisodeErrors
+    extended: EpisodeErrors
+    floor: float | None  # [mm] of the reference's episodes of that split with its own twin
+    gain: Gain
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The whole answer."""
+
+    outcome: str
+    sentence: str
+    causes: tuple[Cause, ...]
+    ranking: tuple[Ranked, ...]
+    errors: Errors
+    errors_ood: Errors | None
+    budget: Mapping[str, Any]  # named {id: mm}, learned, unexplained, floor
+    not_identifiable: tuple[str, ...]
+    not_testable: Mapping[str, str]  # candidate -> why
+    next_motion: Mapping[str, Any] | None
+    exploratory: bool
+    notes: tuple[str, ...]
+    gate: GateResult
+    rounds: tuple[Round, ...]
+    base_twin: Twin  # what was compared with
+    twin: Twin  # carries what was named
+    seconds: float
+    seed: int
+
+    def to_json(self) -> dict[str, Any]:
+        """`diagnosis.json` (DESIGN.md, and beside it what the report shows)."""
+        e = self.errors
+        return {
+            "outcome": self.outcome,
+            "sentence": self.sentence,
+            "exploratory": self.exploratory,
+            "causes": [_cause(c) for c in self.causes],
+            "group": [self.causes[0].id, *self.causes[0].group] if self.causes and self.causes[0].group else [],
+            "ranking": [
+                {"id": r.id, "family": r.family, "probability": r.probability, "gain": r.gain,
+                 "p_adjusted": r.p_adjusted, "rejected": r.rejected, "values": dict(r.values)}
+                for r in self.ranking
+            ],
+            "error_mm": _errors(e),
+            "error_mm_ood": {} if self.errors_ood is None else _errors(self.errors_ood),
+            "gain": {
+                "mean_mm": e.gain.mean, "low_mm": e.gain.low, "high_mm": e.gain.high,
+                "episodes_improved": f"{e.gain.improved}/{e.gain.episodes}",
+                "p_adjusted": min((c.p_adjusted for c in self.causes), default=1.0),
+            },
+            "budget": dict(self.budget),
+            "not_identifiable": list(self.not_identifiable),
+            "not_testable": dict(self.not_testable),
+            "next_motion": None if self.next_motion is None else dict(self.next_motion),
+            "notes": list(self.notes),
+            "gate": self.gate.to_json(),
+            "seconds": self.seconds,
+            "seed": self.seed,
+        }  # fmt: skip
+
+
+def _cause(c: Cause) -> dict[str, Any]:
+    return {
+        "id": c.id,
+        "family": c.family,
+        "probability": c.probability,
+        "kind": "measurement" if c.measured else "physics",
+        "closed": c.closed,
+        "p_adjusted": c.p_adjusted,
+        "group": list(c.group),
+        "parameters": {
+            k: {"value": v.value, "unit": v.unit, "low": v.low, "high": v.high, "at_bound": v.at_bound}
+            for k, v in c.parameters.items()
+        },
+    }
+
+
+def _errors(e: Errors) -> dict[str, Any]:
+    return {
+        "base": e.base.mean,
+        "extended": e.extended.mean,
+        "floor": e.floor,
+        "split": e.split,
+        "episodes": {n: [float(a), float(b)] for n, a, b in zip(e.base.names, e.base.values, e.extended.values, strict=True)},
+    }

@@ -1,0 +1,75 @@
+"""What a person reads: the one sentence, and what no data of this kind can tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pred_core.types import Episode
+
+if TYPE_CHECKING:
+    from pred_core.diagnose.result import Cause, Diagnosis
+    from pred_core.diagnose.rounds import Progress
+
+NAMES = {
+    "drag_linear": "air drag", "drag_quadratic": "quadratic air drag", "gravity_offset": "a different gravity direction",
+    "bending_damping": "damping in bending", "bending_hysteresis": "dry friction inside the cable", "wind": "wind",
+    "attraction": "a force towards a place", "tether": "a thread to a fixed point", "obstacle": "an obstacle",
+    "friction_scale": "another friction coefficient", "friction_viscous": "viscous friction on the table",
+    "friction_anisotropic": "friction that depends on the direction", "friction_patch": "a patch of other friction",
+    "table_height": "another table height", "table_tilt": "a tilted table", "tip_mass": "mass at the tip",
+    "mass_gradient": "mass that changes along the object", "bending_scale": "another bending stiffness",
+    "bending_region": "a piece of other stiffness", "bending_gradient": "stiffness that changes along the object",
+    "friction_drift": "friction that drifts over the session", "stiffness_drift": "stiffness that drifts over the session",
+    "bending_creep": "creep of the rest shape", "bending_plasticity": "plastic bending", "rest_bow": "a rest curvature",
+    "grip_slip": "slip in the gripper", "delay": "a delay of the tracks", "camera_scale": "a scale error of the camera",
+    "camera_rotation": "a rotation of the camera", "camera_translation": "a shift of the camera",
+    "gripper_offset": "an offset of the gripper frame",
+}  # fmt: skip
+STILL = 0.01  # [m] of gripper travel in an episode below which nothing is excited
+
+
+def called(cause: Cause) -> str:
+    """A cause in words with its main number."""
+    words = NAMES.get(cause.id, cause.id.replace("_", " "))
+    first = next(iter(cause.parameters.items()), None)
+    if first is None:
+        return words
+    _, v = first
+    return f"{words}: {v.value:.3g} {v.unit} [{v.low:.3g}, {v.high:.3g}]"
+
+
+def sentence(d: Diagnosis) -> str:
+    """The sentence a report opens with."""
+    e = d.errors
+    numbers = (
+        f"the held-out error falls from {e.base.mean:.1f} to {e.extended.mean:.1f} mm, "
+        f"{e.gain.improved} of {e.gain.episodes} episodes"
+    )
+    label = "Exploratory, too few episodes for a firm answer: " if d.exploratory else ""
+    if d.outcome == "none":
+        return f"{label}Nothing is found that your simulation lacks: its held-out error is {e.base.mean:.1f} mm."
+    if d.outcome == "unknown":
+        near = ", ".join(NAMES.get(c.id, c.id) for c in d.causes)
+        partly = f" ({near} explains a part)" if near else ""
+        return f"{label}Your simulation lacks something that no candidate explains{partly}; {numbers}."
+    what = "; and ".join(called(c) for c in d.causes)
+    group = d.causes[0].group
+    unsure = f" (or {', '.join(NAMES.get(g, g) for g in group)}: these data do not tell)" if group else ""
+    return f"{label}Your simulation lacks {what}{unsure}; with it {numbers}."
+
+
+def not_identifiable(progress: Progress, episodes: Sequence[Episode]) -> list[str]:
+    """What these data cannot tell, whatever the method."""
+    rows = ["absolute mass (no force was measured: only ratios of forces and masses act)"]
+    twin = progress.bench.twin
+    moves = [float(np.ptp(e.grips.position.double().numpy(), axis=0).max(initial=0.0)) for e in episodes]
+    if not moves or max(moves) < STILL:
+        rows.append("anything that needs motion of the gripper (it stands still in every episode)")
+    if twin.scene.ground is None:
+        rows.append("friction and height of a table (nothing is touched)")
+        rows.append("a tilt of gravity against a rotation of the camera (nothing touches a table)")
+    rows.append("axial damping of a rope that hardly stretches")
+    return rows
