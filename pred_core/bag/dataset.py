@@ -20,7 +20,8 @@ from pred_core.types import STANDARD_GRAVITY, Episode, ObjectInfo
 
 FILE = "dataset.yaml"
 SPLITS = ("train", "test", "ood")
-KNOWN_FACTS = ("mass", "rest_length")  # [kg], [m]; other facts are allowed, near misses of these are not
+# [kg], [m], [m]. Other facts are allowed, near misses of these are not; `ground` [m], a height, has any sign.
+KNOWN_FACTS = ("mass", "rest_length", "radius")
 
 
 @dataclass(frozen=True)

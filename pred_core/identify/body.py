@@ -51,9 +51,11 @@ def lay_out(dataset: Dataset, episodes: Sequence[Episode], config: IdentifyConfi
     shortest = 1.001 * float(edges.max() if edges is not None else spacing.max())
     mass = dataset.known.get("mass")
     physics = dataclasses.replace(Physics(), connection_threshold=shortest, max_springs=2 if edges is not None else 8)
-    body = build_body(kind, rest, float(mass or config.mass), physics, id=ids, rest_length=edges, radius=config.radius)
+    radius = float(dataset.known.get("radius", 0.0)) if config.radius is None else config.radius
+    ground = dataset.known.get("ground") if config.ground is None else config.ground
+    body = build_body(kind, rest, float(mass or config.mass), physics, id=ids, rest_length=edges, radius=radius)
     body = dataclasses.replace(body, surface=np.any([e.tracks.visible.any(axis=0) for e in episodes], axis=0))
-    scene = Scene(gravity=dataset.gravity, ground=config.ground)
+    scene = Scene(gravity=dataset.gravity, ground=None if ground is None else float(ground))
     return Layout(body, scene, shortest, max(WIDEST * float(np.median(spacing)), 1.01 * shortest), mass is not None)
 
 
