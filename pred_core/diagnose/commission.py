@@ -23,7 +23,7 @@ from pred_core.twin import Twin
 from pred_core.types import Array, Episode, Physics
 
 BASE = ("stiffness", "ground_friction", "bending_stiffness")  # refined; axial damping does not show
-ROOM = 1.35  # times the substeps of the given twin that the refined one may need
+ROOM = 1.15  # times the substeps of the given twin that the refined one may need
 WORST = 0.25  # [m] mean error of a twin that is not this object's
 POLISH = 8  # steps of the base's refinement
 

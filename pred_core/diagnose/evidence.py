@@ -13,7 +13,8 @@ from pred_core.diagnose.trial import Trial
 from pred_core.types import Array
 
 FLIPS = 20_000
-ACTS = 0.02  # standard deviations of a residual by which a cause must move an episode to count as acting in it
+ACTS = 0.1  # standard deviations of a residual by which a cause must move an episode to count as acting in it
+NESTED = 0.97  # of the best gain: with fewer parameters, so little less is the better name
 CONFIDENCE = 0.90  # of the set of causes that cannot be told apart
 
 
@@ -103,16 +104,30 @@ def set_limit(episodes: int) -> float:
 
 def simplest(judged: Sequence[Judged], best: Judged) -> Judged:
     """The candidate with fewest parameters that is not worse than `best` by more than one standard error."""
-    near = [j for j, z in rivals(judged, best) if z <= 1.0 and j.parameters < best.parameters and j.mean >= 0.9 * best.mean]
+    near = [
+        j
+        for j, z in rivals(judged, best)
+        if j.parameters < best.parameters and (j.mean >= NESTED * best.mean or (z <= 1.0 and j.mean >= 0.9 * best.mean))
+    ]
     return min(near, key=lambda j: (j.parameters, -j.mean), default=best)
 
 
-def lack_of_fit(suspect: Array, reference: Array, seed: int) -> float:
-    """p value that episodes fit worse than the reference's: permutation of their log losses, one-sided."""
+def lack_of_fit(
+    suspect: Array, reference: Array, seed: int, ground: NDArray[np.bool_], ground_of_reference: NDArray[np.bool_]
+) -> float:
+    """p value that episodes fit worse than the reference's: permutation of their log losses, one-sided.
+
+    On the ground and in the air by themselves, because a cause may act in one of them only (Bonferroni).
+    """
     generator = np.random.default_rng(seed)
-    both = np.log(np.concatenate((suspect, reference)) + 1e-9)
-    count = len(suspect)
-    observed = both[:count].mean() - both[count:].mean()
-    draws = np.array([generator.permutation(both) for _ in range(4000)])
-    difference = draws[:, :count].mean(axis=1) - draws[:, count:].mean(axis=1)
-    return float((1 + (difference >= observed).sum()) / (1 + len(draws)))
+    p = []
+    for where in (True, False):
+        one, other = suspect[ground == where], reference[ground_of_reference == where]
+        if len(one) < 3 or len(other) < 3:
+            continue
+        both = np.log(np.concatenate((one, other)) + 1e-9)
+        observed = both[: len(one)].mean() - both[len(one) :].mean()
+        draws = np.array([generator.permutation(both) for _ in range(4000)])
+        difference = draws[:, : len(one)].mean(axis=1) - draws[:, len(one) :].mean(axis=1)
+        p.append(float((1 + (difference >= observed).sum()) / (1 + len(draws))))
+    return min(1.0, len(p) * min(p)) if p else 1.0

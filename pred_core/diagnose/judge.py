@@ -13,13 +13,14 @@ from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import ACTS, Judged
 from pred_core.diagnose.fit import Target, fit, rho, without_groups
 from pred_core.diagnose.journal import Journal
-from pred_core.diagnose.search import Start, refine_trial, starts
+from pred_core.diagnose.search import Start, starts
 from pred_core.diagnose.trial import Trial, make_trial, scanned
 from pred_core.effects.effect import Effect
 from pred_core.twin import Twin
 from pred_core.types import Array
 
 KEPT_STARTS = 4
+QUICK, TRIED = 2, 2  # steps, and starts, of a candidate before it is told whether it goes on
 NULL_STEPS = 4  # of a candidate's refinement on the reference
 Tell = Callable[[str], None]
 Effects = tuple[type[Effect], ...]
@@ -81,6 +82,18 @@ def screen(bench: Bench, effects: Effects, rng: np.random.Generator, journal: Jo
     return Screened(effects, trial, found, found[0].promise, trial.space.start())
 
 
+def quick(bench: Bench, screened: Screened, journal: Journal, key: str) -> tuple[Array, float]:
+    """(coordinates, loss on the train episodes) after a few steps from each start."""
+
+    def find() -> list[object]:
+        ends = [fit(bench.fitted, screened.trial.space, s.z, QUICK) for s in screened.starts[:TRIED]]
+        best = min(ends, key=lambda f: float(f.loss.mean()))
+        return [best.z.tolist(), float(best.loss.mean())]
+
+    z, loss = journal.once(key, find)
+    return np.array(z), float(loss)
+
+
 def null_of(bench: Bench, screened: Screened) -> Array:
     """Coordinates of "no change": what the reference says of the candidate's parameters, else off.
 
@@ -123,7 +136,7 @@ def _judge(bench: Bench, screened: Screened) -> dict[str, object]:
     """Plain values of a candidate: coordinates, those without each recording, gains and losses per episode."""
     trial, space, target = screened.trial, screened.trial.space, bench.target
     train = bench.train
-    result = refine_trial(bench.fitted, trial, screened.starts, bench.config.iterations)
+    result = fit(bench.fitted, trial.space, screened.starts[0].z, bench.config.iterations)
     null = null_of(bench, screened)
     sample = target.roller.sample
     left_out = without_groups(result, space, sample.groups[train])

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pred_core.diagnose.sample import Sample
@@ -21,6 +22,7 @@ from pred_core.twin import Twin
 from pred_core.types import Array, Grip, State
 
 FARTHEST = 0.5  # [m] a coordinate's error counts with at most; also where the simulation is not finite
+NEAR = 0.01  # [m]
 MOST_WORLDS = 1536  # in one kernel call
 LADDER = (1.0, 1.15, 1.35, 1.6, 2.0, 2.5, 3.2, 4.0)  # times the substeps the twin needs: what candidates get
 MOST_FACTOR = LADDER[-1]
@@ -131,6 +133,17 @@ class Roller:
         error = positions.unflatten(1, (count, width)) - w.target[:, rows][:, None]
         left = torch.cat((after.memory["effects"], after.memory["steps"][:, None]), dim=1)
         return error, left.unflatten(0, (count, width))
+
+
+def on_ground(roller: Roller) -> NDArray[np.bool_]:
+    """(E,) whether an episode touches the ground: a tenth of what was seen lies within NEAR of it."""
+    sample, ground = roller.sample, roller.twin.scene.ground
+    if ground is None:
+        return np.zeros(sample.episodes, dtype=bool)
+    w = sample.windows
+    low = (w.target[..., 2] < ground + roller.twin.body.radius + NEAR) & w.seen
+    share = low.sum(dim=(0, 2)) / w.seen.sum(dim=(0, 2)).clamp_min(1)
+    return np.asarray(sample.per_episode(share.double().numpy()) > 0.1)
 
 
 def _tile(values: Tensor, count: int) -> Tensor:

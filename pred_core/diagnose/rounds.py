@@ -12,7 +12,8 @@ import numpy as np
 from pred_core.diagnose.commission import with_values
 from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals, set_limit, simplest
 from pred_core.diagnose.journal import Journal
-from pred_core.diagnose.judge import Bench, Effects, Screened, Tell, judge, rng_of, screen
+from pred_core.diagnose.judge import QUICK, Bench, Effects, Screened, Tell, judge, quick, rng_of, screen
+from pred_core.diagnose.roll import on_ground
 from pred_core.diagnose.search import Start
 from pred_core.diagnose.trial import NOT_A_NAME, make_trial
 from pred_core.effects import LIBRARY
@@ -22,6 +23,8 @@ GATE_ONLY = ("gripper_offset", "gripper_rotation")  # absorbed by measured start
 WORTH = 0.02  # of the floor: what a candidate must promise to be fitted to the end
 LEFT = 0.25  # of the floor: an excess that is called unknown if nothing explains it
 SURE = 0.01  # p value of a lack of fit
+FEW, FINALISTS = 2, 5  # candidates that are fitted to the end: at least, and at most
+BEHIND = 0.35  # share of the leader's gain below which the others are not
 PAIRED = 5  # candidates whose pairs are tried
 STANDING = 0.05  # of the floor: a gain below is not worth a name, whatever its significance
 
@@ -99,17 +102,20 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
             tell(f"round {number + 1}: screening {n}/{len(options)}")
     screened.sort(key=lambda s: -s.promise)
     tell("round {}: most promising: {}".format(number + 1, ", ".join(s.trial.id for s in screened[:4])))
-    kept = _survivors(screened, config.survivors, WORTH * (floor or float(base.mean())))
+    worth = WORTH * (floor or float(base.mean()))
+    kept = _survivors(screened, config.survivors, worth)
+    finalists = _halve(progress, kept, worth, tell, number)
     judged: list[Judged] = []
-    for n, s in enumerate(kept):
+    for n, s in enumerate(finalists):
         judged.append(judge(bench, s, progress.journal, f"{number}/fit/{s.trial.id}"))
         gain = f"gain {judged[-1].mean:.3f} of {base.mean():.3f}"
-        tell(f"round {number + 1}: fitted {n + 1}/{len(kept)}, {s.trial.id}: {gain}")
+        tell(f"round {number + 1}: fitted {n + 1}/{len(finalists)}, {s.trial.id}: {gain}")
+    kept = finalists
     excess = max(float(base.mean()) - floor, 0.0)
     found, rows = _choose(judged, excess, floor, progress, tell)
     closed = found.closed if found else 0.0
     if found is None or closed < config.enough:
-        pair = _pairs(progress, kept, judged, base, floor, found, tell, number)
+        pair = _pairs(progress, kept, judged, base, floor, tell, number)
         if pair is not None:
             found = pair
             rows = [*rows, (pair.judged, pair.p_adjusted, "")]
@@ -136,7 +142,9 @@ def finish(progress: Progress) -> None:
     if bench.reference is None:
         return
     suspect, reference = bench.standing(), _reference_losses(bench)
-    p = lack_of_fit(suspect, reference, bench.config.seed)
+    p = lack_of_fit(
+        suspect, reference, bench.config.seed, on_ground(bench.target.roller), on_ground(bench.reference.roller)
+    )
     progress.unknown_p = p
     progress.unknown = p < SURE and float(suspect.mean()) > (1.0 + LEFT) * float(reference.mean())
 
@@ -167,6 +175,22 @@ def _survivors(screened: list[Screened], count: int, least: float) -> list[Scree
             kept.append(s)
             families.add(s.trial.family)
     return kept or screened[:2]
+
+
+def _halve(
+    progress: Progress, kept: Sequence[Screened], worth: float, tell: Tell, number: int
+) -> list[Screened]:
+    """The candidates that lead after a few steps: a straight line promises little of a localized cause."""
+    bench = progress.bench
+    before = float(bench.standing()[bench.train].mean())
+    rows = []
+    for s in kept:
+        z, loss = quick(bench, s, progress.journal, f"{number}/quick/{s.trial.id}")
+        rows.append((before - loss, dataclasses.replace(s, starts=[Start(z, before - loss)])))
+    rows.sort(key=lambda row: -row[0])
+    tell(f"round {number + 1}: ahead after {QUICK} steps: " + ", ".join(r[1].trial.id for r in rows[:4]))
+    least = max(BEHIND * rows[0][0], worth)
+    return [s for n, (saved, s) in enumerate(rows) if n < FEW or (n < FINALISTS and saved >= least)]
 
 
 def _choose(
@@ -214,7 +238,6 @@ def _pairs(
     judged: Sequence[Judged],
     base: Array,
     floor: float,
-    single: Named | None,
     tell: Tell,
     number: int,
 ) -> Named | None:
@@ -225,7 +248,7 @@ def _pairs(
         return None
     order = sorted(range(len(judged)), key=lambda n: -judged[n].mean)[:PAIRED]
     best: Judged | None = None
-    alone = single.judged.mean if single else 0.0
+    alone = max(j.mean for j in judged)
     tried: list[Judged] = []
     for a, b in itertools.combinations(order, 2):
         if judged[a].trial.family == judged[b].trial.family:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from pred_core.diagnose.fit import Fit, Target, fit, rho
+from pred_core.diagnose.fit import Target, rho
 from pred_core.diagnose.trial import Trial, first_values, scanned
 from pred_core.effects import find_effect
 from pred_core.identify.space import Candidate, SearchSpace
@@ -18,7 +17,6 @@ from pred_core.types import Array
 
 SECANT = 0.7  # typical changes of the switch, over which a first slope is taken
 SCANNED = 16  # windows in which places are tried, those with the largest loss: one block of worlds
-TRIED = 2  # starts of a localized cause that are refined
 
 
 @dataclass(frozen=True)
@@ -85,19 +83,6 @@ def starts(target: Target, trial: Trial, count: int, rng: np.random.Generator) -
         found.append(Start(z, promise))
     found.sort(key=lambda s: -s.promise)
     return found or [Start(null, 0.0)]
-
-
-def refine_trial(
-    target: Target, trial: Trial, begin: list[Start], iterations: int, chosen: NDArray[np.bool_] | None = None
-) -> Fit:
-    """The best of the refinements from the first starts; a localized cause is refined from several."""
-    many = any(scanned(find_effect(i)) for i in trial.ids)
-    first = begin[: TRIED if many else 1]
-    if len(first) > 1:
-        short = [fit(target, trial.space, s.z, 2, chosen) for s in first]
-        best = min(short, key=lambda f: float(f.loss.mean()))
-        return fit(target, trial.space, best.z, iterations, chosen)
-    return fit(target, trial.space, first[0].z, iterations, chosen)
 
 
 def _scanned_values(extension: Extension) -> dict[str, tuple[float, ...]]:
