@@ -1,0 +1,86 @@
+"""Which cases the benchmark of hidden effects has: effects, magnitudes and seeds, drawn; references beside them.
+
+Development cases chose what is frozen in the code. Final cases have other seeds, so other motions, noise, directions,
+places and magnitudes; they were looked at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pred_core.plant.hidden.library import LIBRARY
+from pred_core.plant.rope_case import Hidden, write_rope_case
+from pred_core.plant.session import SessionConfig
+
+SESSION = SessionConfig(train=12, test=4, ood=3, seconds=4.0)
+LEAST, MOST = 2.0, 10.0  # magnitudes, in multiples of the effect's declared minimum, log-uniform
+
+
+@dataclass(frozen=True)
+class Case:
+    """One data set with something hidden in it, or nothing."""
+
+    name: str
+    seed: int
+    hidden: Hidden
+    reference: str  # name of the reference it is diagnosed with
+
+
+@dataclass(frozen=True)
+class Release:
+    """References, each by its seed, and the cases diagnosed with them in turn."""
+
+    references: Mapping[str, int]
+    cases: tuple[Case, ...]
+
+
+def cases(first: int, seed: int, controls: int, singles: int, unlisted: int, pairs: int) -> list[tuple[int, Hidden]]:
+    """(seed, what is hidden) of every case, shuffled; seeds count up from first + 1."""
+    generator = np.random.default_rng(seed)
+    listed = [n for n, e in LIBRARY.items() if not e.unlisted]
+    others = [n for n, e in LIBRARY.items() if e.unlisted]
+
+    def magnitude(name: str) -> float:
+        entry = LIBRARY[name]
+        factor = float(np.exp(generator.uniform(np.log(LEAST), np.log(MOST))))
+        return min(entry.minimum * factor, entry.high)
+
+    def in_turn(names: list[str], count: int) -> list[str]:
+        order: list[str] = []
+        while len(order) < count:
+            order += [names[i] for i in generator.permutation(len(names))]
+        return order[:count]
+
+    rows: list[Hidden] = [()] * controls
+    rows += [((n, magnitude(n)),) for n in in_turn(listed, singles)]
+    rows += [((n, magnitude(n)),) for n in in_turn(others, unlisted)]
+    for _ in range(pairs):
+        a, b = (listed[i] for i in generator.choice(len(listed), 2, replace=False))
+        rows.append(((a, magnitude(a)), (b, magnitude(b))))
+    order = generator.permutation(len(rows)).tolist()
+    return [(first + 1 + i, rows[j]) for i, j in enumerate(order)]
+
+
+def _release(references: tuple[int, ...], drawn: list[tuple[int, Hidden]]) -> Release:
+    names = [f"ref{r}" for r in references]
+    return Release(
+        dict(zip(names, references, strict=True)),
+        tuple(Case(f"case{s}", s, h, names[n % len(names)]) for n, (s, h) in enumerate(drawn)),
+    )
+
+
+def release(which: str) -> Release:
+    """"dev": chose what is frozen; "final": what is reported."""
+    if which == "dev":
+        return _release((7000,), cases(7100, 1, 8, 26, 7, 4))
+    return _release((50000, 51000, 52000, 53000), cases(50100, 2, 40, 46, 10, 6))
+
+
+def simulate(root: Path, hidden: Hidden, seed: int) -> None:
+    """Write the data set, unless it is finished."""
+    if not (root / "dataset.yaml").exists():
+        write_rope_case(root, hidden, seed, lambda done, total, name: None, session=SESSION)

@@ -1,0 +1,179 @@
+"""Hide effects in another engine's world, diagnose every case, and score the names.
+
+    python benchmarks/hidden_effects.py run --work out/hidden --jobs 2
+        draw the final cases, simulate them, identify one twin per reference, diagnose; goes on where it stopped
+    python benchmarks/hidden_effects.py score --work out/hidden
+        the table in markdown, and scores.json in the work folder
+    ... --set dev
+        the development cases, on which everything was chosen; other seeds, other folder
+
+A case's data stand in WORK/<name>, its truth beside it, its diagnosis in WORK/out/<name>.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
+from pathlib import Path
+
+from hidden_cases import Case, Release, release, simulate
+
+from pred_core.plant.case import truth_path
+
+IDENTIFY = shlex.split(
+    "--parameters stiffness,damping,ground_friction,bending_stiffness --effects bending_damping --restarts 2"
+)
+
+
+def main() -> int:
+    """Run one of the commands."""
+    args = _arguments()
+    return int(args.act(args))
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    run = commands.add_parser("run", help="simulate, identify and diagnose")
+    run.set_defaults(act=run_cases)
+    run.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at once")
+    run.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these cases")
+    run.add_argument("--flags", default="", help="more flags for pred diagnose, in one string")
+    score = commands.add_parser("score", help="score the diagnoses that are there")
+    score.set_defaults(act=score_cases)
+    score.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these cases")
+    for command in (run, score):
+        command.add_argument("--work", type=Path, required=True, metavar="DIR", help="where everything stands")
+        command.add_argument("--out", default="out", help="folder of the answers in the work folder")
+        command.add_argument("--set", choices=("final", "dev"), default="final", help="which cases")
+    return parser.parse_args()
+
+
+def chosen(drawn: Release, only: Sequence[str]) -> list[Case]:
+    """The cases that are asked for."""
+    known = {c.name: c for c in drawn.cases}
+    missing = [n for n in only if n not in known]
+    if missing:
+        sys.exit(f"no case {', '.join(missing)}: names are {drawn.cases[0].name} to {drawn.cases[-1].name}")
+    return [known[n] for n in only] if only else list(drawn.cases)
+
+
+def run_cases(args: argparse.Namespace) -> int:
+    """What is missing: references and their twins, then cases. Returns 1 if something failed."""
+    drawn = release(args.set)
+    cases = chosen(drawn, args.only)
+    references = {c.reference for c in cases}
+    failed = _all(
+        "twin", sorted(r for r in references if not (_twin(args.work, r) / "twin.yaml").exists()), args.jobs,
+        partial(_identify, args.work, drawn.references),
+    )  # fmt: skip
+    todo = {c.name: c for c in cases if not (args.work / args.out / c.name / "diagnosis.json").exists()}
+    print(f"{len(cases) - len(todo)} of {len(cases)} cases are there", flush=True)
+    ready = [n for n, c in todo.items() if c.reference not in failed]
+    failed += _all("case", ready, args.jobs, partial(_diagnose, args, todo))
+    return 1 if failed or len(ready) < len(todo) else 0
+
+
+def _twin(work: Path, reference: str) -> Path:
+    return work / "twins" / reference
+
+
+def _identify(work: Path, seeds: Mapping[str, int], name: str) -> int:
+    simulate(work / name, (), seeds[name])
+    twin = _twin(work, name)
+    return _pred(["identify", str(work / name), "--out", str(twin), *IDENTIFY], twin.parent / f"{name}.log")
+
+
+def _diagnose(args: argparse.Namespace, cases: Mapping[str, Case], name: str) -> int:
+    case, work, out = cases[name], args.work, args.work / args.out / name
+    simulate(work / case.name, case.hidden, case.seed)
+    words = ["diagnose", str(work / case.name), "--twin", str(_twin(work, case.reference)), "--reference",
+             str(work / case.reference), "--out", str(out), *shlex.split(args.flags)]  # fmt: skip
+    return _pred(words, work / args.out / f"{case.name}.log")
+
+
+def _pred(words: Sequence[str], log: Path) -> int:
+    """Exit code of one `pred` command on one thread, its words in a log."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("w", encoding="utf-8") as stream:
+        stream.write("pred " + shlex.join(words) + "\n")
+        stream.flush()
+        return subprocess.run(
+            [sys.executable, "-m", "pred_core.cli.main", *words], stdout=stream, stderr=subprocess.STDOUT,
+            env={**os.environ, "OMP_NUM_THREADS": "1"}, check=False,
+        ).returncode  # fmt: skip
+
+
+def _all(what: str, names: Sequence[str], jobs: int, do: Callable[[str], int]) -> list[str]:
+    """Do it for every name, `jobs` at once, with an estimate of the time left. Returns the names that failed."""
+    begin = time.monotonic()
+    failed = []
+    with ProcessPoolExecutor(max(1, jobs)) as pool:
+        running = {pool.submit(do, name): name for name in names}
+        for done, future in enumerate(as_completed(running), start=1):
+            name, code = running[future], future.result()
+            if code:
+                failed.append(name)
+            passed = time.monotonic() - begin
+            left = passed / done * (len(names) - done)
+            said = f"failed with code {code}, see its log" if code else "done"
+            print(f"{what} {done}/{len(names)} {name} {said}; {passed / 60:.1f} min, {left / 60:.0f} to go", flush=True)
+    return failed
+
+
+def score_cases(args: argparse.Namespace) -> int:
+    """The table of what has been diagnosed."""
+    from hidden_scores import judged
+    from hidden_table import markdown, scores
+
+    drawn = release(args.set)
+    rows, missing = [], []
+    for case in chosen(drawn, args.only):
+        path = args.work / args.out / case.name / "diagnosis.json"
+        if not path.exists():
+            missing.append(case.name)
+            continue
+        answer = json.loads(path.read_text(encoding="utf-8"))
+        truth = json.loads(truth_path(args.work / case.name).read_text(encoding="utf-8"))
+        hidden = tuple((h["effect"], float(h["magnitude"])) for h in truth["hidden"])
+        if hidden != case.hidden or truth["seed"] != case.seed:
+            sys.exit(f"{case.name}: the truth beside it is of another case; use another work folder")
+        oracle = args.work / "oracle" / f"{case.name}.json"
+        rows.append(
+            judged(case.name, case.reference, hidden, answer, base=_base(path.parent),
+                   oracle=json.loads(oracle.read_text(encoding="utf-8")) if oracle.exists() else None)
+        )  # fmt: skip
+    if not rows:
+        sys.exit(f"no diagnosis in {args.work / args.out}: run the cases first")
+    result = scores(rows)
+    print(markdown(result))
+    print(f"\n{len(rows)} cases scored, {len(missing)} without an answer{': ' + ', '.join(missing) if missing else ''};"
+          f" median time {statistics.median(r.seconds for r in rows):.0f} s")  # fmt: skip
+    (args.work / args.out / "scores.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+def _base(out: Path) -> dict[str, float]:
+    """Values of the commissioned twin that some magnitudes are relative to, from the journal."""
+    journal = out / "journal.jsonl"
+    if not journal.exists():
+        return {}
+    for line in journal.read_text(encoding="utf-8").splitlines():
+        entry = json.loads(line)
+        if entry.get("key") == "base":
+            first = entry["value"]["extensions"]
+            return {f"{k}": float(v[0]) for e in first for k, v in e.items()}
+    return {}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
