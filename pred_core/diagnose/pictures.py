@@ -35,6 +35,7 @@ def evidence(seen: Round, words: dict[str, str], accepted: Sequence[str], seed: 
         axes.plot((low, high), (n, n), color=color, linewidth=2.2, solid_capstyle="butt")
         axes.scatter([gain.mean()], [n], s=34, color=color, zorder=3)
     axes.set_yticks(range(len(judged)), [words.get(j.trial.id, j.trial.id) for j in judged])
+    axes.set_ylim(-0.6, len(judged) - 0.4)
     every = 100.0 * np.concatenate([j.gain for j in judged]) / excess
     axes.set_xlim(max(float(every.min()) - 5.0, -150.0), min(float(every.max()) + 5.0, 400.0))
     tidy(axes, "saved on episodes it was not fitted on [% of the mean excess loss]", "")
@@ -46,7 +47,7 @@ def evidence(seen: Round, words: dict[str, str], accepted: Sequence[str], seed: 
 def by_episode(parts: Sequence[Errors]) -> Figure:
     """Every episode's error before and after, one panel a split, in the order of the base's error."""
     rows = max(len(p.base.names) for p in parts)
-    figure = Figure(figsize=(5.2 * len(parts) + 1.0, 1.1 + 0.26 * min(rows, MOST_LABELS)), layout="constrained")
+    figure = Figure(figsize=(5.2 * len(parts) + 1.0, 1.4 + 0.26 * min(rows, MOST_LABELS)), layout="constrained")
     grid = figure.subplots(1, len(parts), squeeze=False, sharex=True)[0]
     for axes, part in zip(grid, parts, strict=True):
         order = np.argsort(part.base.values)
@@ -63,7 +64,8 @@ def by_episode(parts: Sequence[Errors]) -> Figure:
         tidy(axes, "mean error over the whole episode [mm]", "")
         axes.grid(False, axis="y")
     grid[0].set_xlim(left=0.0)
-    grid[0].legend(frameon=False, fontsize=9, loc="lower right")
+    handles, labels = grid[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, fontsize=9)
     return figure
 
 

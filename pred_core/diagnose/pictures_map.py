@@ -25,19 +25,21 @@ def curves(replays: Sequence[Replay], seed: int) -> Figure:
     rows = -(-len(shown) // 4)
     figure = Figure(figsize=(13, 3.0 * rows), layout="constrained")
     grid = figure.subplots(rows, 4, sharey=True, squeeze=False)
+    highest = 1e-3  # a wide band of a thin bin may leave the picture, no mean does
     for axes, feature in zip(grid.flat, shown, strict=False):
         edges = edges_of(replays[0], feature.key)
         for r in replays:
             # The clocks of two sessions have nothing in common.
             own = edges_of(r, feature.key) if feature.key == "session" else edges
             curve = conditional(r, feature.key, own, np.random.default_rng(seed))
+            highest = max(highest, 1.35 * float(np.nanmax(curve.mean, initial=0.0)))
             _bars(axes, curve, r.name) if feature.key == "contact" else _line(axes, curve, r.name)
         _label(axes, feature)
     for axes in grid.flat[len(shown) :]:
         axes.set_visible(False)
     for row in grid:
         row[0].set_ylabel("mean error [mm]", color=INK)
-    grid[0, 0].set_ylim(bottom=0)
+    grid[0, 0].set_ylim(0.0, highest)
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=10)
     return figure
@@ -69,32 +71,36 @@ def seen_from_above(replays: Sequence[Replay]) -> Figure:
     """Mean error where the object was, and its mean horizontal direction, one panel a replay."""
     x, y = grid_of(replays)
     maps = [from_above(r, x, y) for r in replays]
-    most = max(float(np.nanmax(m.mean)) for m in maps)
-    longest = max(float(np.nanmax(np.linalg.norm(m.pull, axis=-1))) for m in maps)
+    # One bad cell must not make all others pale.
+    most = float(np.nanquantile(np.concatenate([m.mean.ravel() for m in maps[:2]]), 0.97))
+    longest = float(np.nanquantile(np.linalg.norm(np.concatenate([m.pull.reshape(-1, 2) for m in maps[:2]]), axis=-1), 0.95))
     height = 1.2 + 3.9 * min(max(np.ptp(y) / np.ptp(x), 0.45), 1.6)
     figure = Figure(figsize=(4.2 * len(maps) + 0.8, height), layout="constrained")
     grid = figure.subplots(1, len(maps), sharex=True, sharey=True, squeeze=False)[0]
     for axes, one, r in zip(grid, maps, replays, strict=True):
-        image = axes.pcolormesh(x, y, one.mean, cmap="YlOrBr", vmin=0.0, vmax=most, edgecolors="face", linewidth=0.1)
-        _arrows(axes, one, longest)
+        image = axes.pcolormesh(x, y, one.mean, cmap="YlOrBr", vmin=0.0, vmax=max(most, 1e-3), edgecolors="face",
+                                linewidth=0.1)  # fmt: skip
+        _arrows(axes, one, longest, x[1] - x[0])
         axes.set_aspect("equal", adjustable="box")
         axes.set_title(r.name, loc="left", fontsize=11, fontweight="bold", color=INK)
         tidy(axes, "x [m]", "y [m]" if axes is grid[0] else "")
-    bar = figure.colorbar(image, ax=list(grid), shrink=0.85, pad=0.015)
+    bar = figure.colorbar(image, ax=list(grid), shrink=0.85, pad=0.015, extend="max")
     bar.set_label("mean error [mm]", color=INK)
     bar.outline.set_edgecolor(GRID)  # type: ignore[operator]
     return figure
 
 
-def _arrows(axes: Axes, one: Above, longest: float) -> None:
-    """Mean of measured minus predicted; the longest of all panels spans 1.3 cells."""
-    side = one.x[1] - one.x[0]
+def _arrows(axes: Axes, one: Above, usual: float, side: float) -> None:
+    """Mean of measured minus predicted, `usual` [mm] as long as 1.3 cells, the longest two cells."""
     xs, ys = np.meshgrid((one.x[1:] + one.x[:-1]) / 2, (one.y[1:] + one.y[:-1]) / 2)
-    scale = max(longest, 1e-9) / (1.3 * side)
-    axes.quiver(xs, ys, one.pull[..., 0], one.pull[..., 1], angles="xy", scale_units="xy", scale=scale, pivot="mid",
-                color=INK, width=0.004, alpha=0.85)  # fmt: skip
-    axes.text(0.99, 0.01, f"longest arrow {longest:.1f} mm", transform=axes.transAxes, ha="right", va="bottom",
-              fontsize=8, color=GREY)  # fmt: skip
+    length = np.linalg.norm(one.pull, axis=-1, keepdims=True)
+    scale = 1.3 * side / max(usual, 1e-9)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        drawn = one.pull / length * np.minimum(length * scale, 2.0 * side)
+    axes.quiver(xs, ys, drawn[..., 0], drawn[..., 1], angles="xy", scale_units="xy", scale=1.0, pivot="mid", color=INK,
+                width=0.005, alpha=0.85)  # fmt: skip
+    axes.text(0.99, 0.01, f"an arrow of one cell: {usual / 1.3:.1f} mm", transform=axes.transAxes, ha="right",
+              va="bottom", fontsize=8, color=GREY)  # fmt: skip
 
 
 def direction(replays: Sequence[Replay], arc: Array) -> Figure:

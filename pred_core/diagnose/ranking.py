@@ -10,6 +10,7 @@ from pred_core.diagnose.result import Ranked
 from pred_core.diagnose.rounds import Named, Round
 
 SHARP = 1.0  # how fast a rival's weight falls with the standard errors it is behind
+UNSEEN = 0.05  # probability left for "unknown" where nothing is seen, and for "none" where something is
 EXPLAINS = (0.45, 8.0)  # share of the excess closed at which "it explains it" is even, and how steeply that rises
 
 
@@ -19,8 +20,8 @@ def explains(closed: float) -> float:
     return 1.0 / (1.0 + math.exp(-slope * (min(closed, 1.2) - middle)))
 
 
-def ranking(rounds: Sequence[Round], named: Sequence[Named]) -> list[Ranked]:
-    """All candidates of the first round; then "unknown" and "none" where they have a share."""
+def ranking(rounds: Sequence[Round], named: Sequence[Named], unknown: bool) -> list[Ranked]:
+    """All candidates of the first round, then "unknown" and "none". `unknown`: something is left without a name."""
     if not rounds or not rounds[0].judged:
         return [Ranked("none", "none", 1.0, 0.0, 1.0, "")]
     first = rounds[0]
@@ -46,8 +47,7 @@ def ranking(rounds: Sequence[Round], named: Sequence[Named]) -> list[Ranked]:
         for j in judged
     ]
     rows.sort(key=lambda r: (-r.probability, -r.gain))
-    least = min((q for _, q, _ in first.judged), default=1.0)
-    none = min(1.0, least) if chosen is None else 0.0
+    none = 0.0 if chosen is not None else UNSEEN if unknown else 1.0 - UNSEEN
     rest = max(0.0, 1.0 - sure - none)
     return [*rows, Ranked("unknown", "unknown", rest, 0.0, 1.0, ""), Ranked("none", "none", none, 0.0, 1.0, "")]
 

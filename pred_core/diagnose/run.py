@@ -92,7 +92,7 @@ def _answer(
     ) else None  # fmt: skip
     exploratory = len([e for e in corrected if e.split != "ood"]) < FEWEST
     outcome = _outcome(causes, progress)
-    ranked = ranking(progress.rounds, progress.named)
+    ranked = ranking(progress.rounds, progress.named, progress.unknown)
     report = dataclasses.replace(
         twin.meta, parent=twin.digest(), notes=(*twin.meta.notes, f"diagnosed: {', '.join(c.id for c in causes) or outcome}")
     )

@@ -1,0 +1,213 @@
+"""Parts of the report that are tables and sentences: summary, evidence, budget, gate, what stays open."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+from pred_core.diagnose import pictures
+from pred_core.diagnose.gate_result import GateCause
+from pred_core.diagnose.result import Cause, Diagnosis, Errors
+from pred_core.diagnose.rounds import Round
+from pred_core.diagnose.said import NAMES
+from pred_core.effects import find_effect
+from pred_core.report import Page, number
+
+Network = Mapping[str, Mapping[str, float]]  # split -> {"base", "base + network", "extended", "extended + network"} mm
+CELLS = ("base", "base + network", "extended", "extended + network")
+
+
+def words(id: str) -> str:
+    """A cause, or several joined by '+', in words."""
+    return " and ".join(NAMES.get(one, one.replace("_", " ")) for one in id.split("+"))
+
+
+def summary(page: Page, d: Diagnosis) -> None:
+    """What was found and what it is worth, in one table each."""
+    rows = []
+    for c in d.causes:
+        for n, (name, v) in enumerate(c.parameters.items()):
+            edge = " (at its bound)" if v.at_bound else ""
+            first = (words(c.id), f"{c.probability:.2f}", "sensor" if c.measured else "physics") if n == 0 else ("", "", "")
+            rows.append((*first, name, f"{number(v.value)} {v.unit}{edge}", f"{number(v.low)} to {number(v.high)}"))
+    if rows:
+        page.table(("cause", "probability", "kind", "parameter", "value", "90 % interval"), rows)
+    page.table(
+        ("episodes", "base [mm]", "extended [mm]", "reference [mm]", "gain [mm]", "95 % interval", "improved"),
+        [_error_row(e) for e in (d.errors, d.errors_ood) if e is not None],
+    )
+    p = min((c.p_adjusted for c in d.causes), default=None)
+    note = "Whole episodes, open loop; mean distance of free particles. Intervals draw episodes."
+    page.text(note if p is None else f"{note} p {p:.2g}, adjusted for the number of candidates.", note=True)
+    for line in d.notes:
+        page.text(line, note=True)
+
+
+def _error_row(e: Errors) -> tuple[str, ...]:
+    g = e.gain
+    return (
+        e.split, f"{e.base.mean:.2f}", f"{e.extended.mean:.2f}", "–" if e.floor is None else f"{e.floor:.2f}",
+        f"{g.mean:.2f}", f"{g.low:.2f} to {g.high:.2f}", f"{g.improved} of {g.episodes}",
+    )  # fmt: skip
+
+
+def add_evidence(page: Page, d: Diagnosis) -> None:
+    """Every candidate with what it saves and why it is not named, round by round."""
+    page.heading("Evidence: what explains it, and what does not")
+    page.text(
+        "A candidate is fitted on the train episodes and judged on episodes it did not see. 100 % is the mean excess of "
+        "the base over what the reference leaves (without a reference: over nothing). Dots are episodes, bars 95 %.",
+        note=True,
+    )
+    if not d.rounds:
+        page.text("No candidate was tried.")
+    for n, seen in enumerate(d.rounds):
+        if not seen.judged:
+            continue
+        accepted = [j.trial.id for j, _, why in seen.judged if not why and _is_named(j.trial.id, d.causes)]
+        ids = {j.trial.id: words(j.trial.id) for j, _, _ in seen.judged}
+        after = "" if n == 0 else " (after what was named before)"
+        page.figure(pictures.evidence(seen, ids, accepted, d.seed), f"Round {n + 1}{after}. Green: named.")
+        _ranking_table(page, d) if n == 0 else _round_table(page, seen)
+        _only_screened(page, seen)
+
+
+def _is_named(id: str, causes: Sequence[Cause]) -> bool:
+    return set(id.split("+")) <= {c.id for c in causes}
+
+
+def _ranking_table(page: Page, d: Diagnosis) -> None:
+    rows, marks = [], []
+    named = {c.id for c in d.causes}
+    for r in d.ranking:
+        special = r.id in ("unknown", "none")
+        p = "–" if special else f"{r.p_adjusted:.2g}"
+        gain = "–" if special else f"{100 * r.gain:.0f} %"
+        label = {"unknown": "something not in the library", "none": "nothing"}.get(r.id) or words(r.id)
+        is_named = r.id in named
+        why = _in_words(r.rejected, [other.id for other in d.ranking]) or ("named" if is_named else "")
+        rows.append((label, r.family, f"{r.probability:.2f}", gain, p, _values(r.values), why))
+        marks.append("strong" if is_named else "")
+    page.table(("candidate", "family", "probability", "saves", "p adjusted", "fitted", "verdict"), rows, marks)
+
+
+def _in_words(text: str, ids: Sequence[str]) -> str:
+    """A verdict with candidates' ids replaced."""
+    for id in sorted(ids, key=len, reverse=True):
+        text = re.sub(rf"\b{re.escape(id)}\b", words(id), text)
+    return text
+
+
+def _round_table(page: Page, seen: Round) -> None:
+    excess = max(float(seen.base.mean()) - seen.floor, 1e-9)
+    rows = [
+        (words(j.trial.id), j.trial.family, f"{100 * j.mean / excess:.0f} %", f"{q:.2g}", _values(j.values),
+         why or "accepted")
+        for j, q, why in seen.judged
+    ]  # fmt: skip
+    page.table(("candidate", "family", "saves", "p adjusted", "fitted", "verdict"), rows)
+
+
+def _values(values: Mapping[str, float]) -> str:
+    """Parameters that are not vectors too long to read."""
+    shown = {k.split(".", 1)[-1].replace("[0]", ""): v for k, v in values.items() if "." in k}
+    text = ", ".join(f"{k} {number(v)}" for k, v in list(shown.items())[:5])
+    return text + (", ..." if len(shown) > 5 else "")
+
+
+def _only_screened(page: Page, seen: Round) -> None:
+    fitted = {i for j, _, _ in seen.judged for i in j.trial.ids}
+    rest = [words(i) for i, _ in seen.screened if i not in fitted]
+    if rest:
+        page.text(f"Screened and not fitted, because they promised less: {', '.join(rest)}.", note=True)
+
+
+def budget_rows(d: Diagnosis) -> list[tuple[str, float, str]]:
+    """(name, mm, colour) that add up to the base's held-out error."""
+    rows = []
+    for n, (id, mm) in enumerate(d.budget["named"].items()):
+        rows.append((words(id), float(mm), pictures.NAMED[n % len(pictures.NAMED)]))
+    rows.append(("learned by a network", float(d.budget["learned"]), pictures.LEARNED))
+    rows.append(("unexplained", float(d.budget["unexplained"]), pictures.UNEXPLAINED))
+    rows.append(("floor: noise, chaos, known misfit", float(d.budget["floor"]), pictures.FLOOR))
+    rest = d.errors.base.mean - sum(v for _, v, _ in rows)
+    if abs(rest) > 1e-6 * max(d.errors.base.mean, 1.0):
+        rows.append(("base refitted", rest, pictures.OTHER))
+    return rows
+
+
+def add_budget(page: Page, d: Diagnosis) -> None:
+    """One stacked bar and its numbers."""
+    page.heading("Error budget")
+    rows, total = budget_rows(d), d.errors.base.mean
+    page.figure(pictures.budget_bar(rows), f"Where the {total:.1f} mm of the base come from ({d.errors.split} episodes).")
+    table = [(name, f"{mm:.2f}", f"{100 * mm / total:.0f} %" if total > 0 else "–") for name, mm, _ in rows]
+    table = [row for row, (_, mm, _) in zip(table, rows, strict=True) if mm != 0.0]
+    page.table(("part", "mm", "share"), [*table, ("sum = base", f"{sum(v for _, v, _ in rows):.2f}", "100 %")],
+               [*[""] * len(table), "strong"])  # fmt: skip
+    if d.errors.floor is None:
+        page.text("Without a reference there is no floor: noise and chaos are part of what is unexplained.", note=True)
+
+
+def add_gate(page: Page, d: Diagnosis) -> None:
+    """What clock, camera, grip and table get wrong, measured without the simulation."""
+    page.heading("Measured without the simulation")
+    compared = f"{d.gate.reference} reference episodes" if d.gate.reference else "the twin and zero"
+    page.text(f"{d.gate.episodes} episodes against {compared}; track noise {1e3 * d.gate.sigma:.2f} mm. Intervals are "
+              "90 %; p is adjusted for all causes tested.", note=True)  # fmt: skip
+    rows, marks = [], []
+    for c in d.gate.causes:
+        verdict = "found" if c.accepted else "not found" if c.testable else "not testable"
+        p = f"{c.p_adjusted:.2g}" if c.testable else "–"
+        effect = f"{c.effect_mm:.2f}" if c.parameters else "–"
+        near = f"; as well: {', '.join(map(words, c.confused_with))}" if c.confused_with else ""
+        rows.append((words(c.id), verdict, _measured(c), p, effect, c.why + near))
+        marks.append("strong" if c.accepted else "" if c.testable else "warn")
+    page.table(("cause", "verdict", "estimate", "p adjusted", "at the object [mm]", "rests on"), rows, marks)
+
+
+READ_AS = {"m": (1e3, "mm"), "s": (1e3, "ms"), "rad": (1e3, "mrad"), "1": (100.0, "%")}
+
+
+def _measured(c: GateCause) -> str:
+    """The estimate with its interval, in units to read."""
+    factor, unit = READ_AS.get(c.unit, (1.0, c.unit))
+    parts = []
+    for name, values in c.parameters.items():
+        spans = c.interval.get(name, ())
+        for k, value in enumerate(values):
+            label = "" if len(c.parameters) == len(values) == 1 else f"{name} " if len(values) == 1 else f"{'xyz'[k]} "
+            low, high = (factor * v for v in spans[k]) if k < len(spans) else (0.0, 0.0)
+            span = f" [{low:.2f}, {high:.2f}]" if k < len(spans) else ""
+            parts.append(f"{label}{factor * value:.2f}{span}")
+    return f"{', '.join(parts)} {unit}" if parts else "–"
+
+
+def add_open_questions(page: Page, d: Diagnosis) -> None:
+    """What these data cannot tell."""
+    page.heading("What cannot be told apart")
+    for c in d.causes:
+        if c.group:
+            page.text(f"These data do not tell {words(c.id)} from {', '.join(map(words, c.group))}.")
+        elif not c.measured:
+            usual = [words(i) for i in find_effect(c.id).confounded_with]
+            if usual:
+                page.text(f"Often confused with {words(c.id)}, and told apart here: {', '.join(usual)}.", note=True)
+    page.table(("no data of this kind tells",), [(line,) for line in d.not_identifiable])
+    if d.not_testable:
+        page.table(("not testable with these motions", "why"), [(words(k), v) for k, v in d.not_testable.items()])
+
+
+def add_network(page: Page, network: Network | None) -> None:
+    """Base and extended, each without and with a network."""
+    page.heading("With and without a network")
+    if network is None:
+        page.text(
+            "No network is part of this answer: it is trained on the extended twin after the causes are named, so that it "
+            "cannot hide them. Base and extended, each with and without one, are compared by:"
+        )
+        page.code("pred train DATASET --twin DIR/twin")
+        page.code("pred evaluate DATASET --twin DIR/twin --out EVALUATION")
+        return
+    rows = [(split, *(number(cells.get(c)) for c in CELLS)) for split, cells in network.items()]
+    page.table(("episodes", *(f"{c} [mm]" for c in CELLS)), rows)
