@@ -78,7 +78,9 @@ class Curve:
     high: Array  # (B,)
 
 
-def replay(name: str, twin: Twin, episodes: Sequence[Episode], calibration: Calibration, begin: int | None = None) -> Replay:
+def replay(
+    name: str, twin: Twin, episodes: Sequence[Episode], calibration: Calibration, begin: int | None = None
+) -> Replay:
     """The twin over these episodes as `calibration` corrects them. `begin` [ns]: when the session began.
 
     Raises: DatasetError if an episode has no complete frame to start from.

@@ -79,7 +79,9 @@ def limits_of(episodes: Sequence[Episode]) -> Limits:
     return Limits(every.min(axis=0), every.max(axis=0), max(speeds), max(accelerations), max(rates), max(turns))
 
 
-def library(grip: Grip, home: int, limits: Limits, period: float, grip_axis: Array, over: Array, table: bool) -> list[Motion]:
+def library(
+    grip: Grip, home: int, limits: Limits, period: float, grip_axis: Array, over: Array, table: bool
+) -> list[Motion]:
     """Motions from the pose `grip` (G, ...). `grip_axis` (3,): the object's direction where it is held; `over` (3,):
     horizontal direction from the grippers to the object's middle; `table`: the object lies on a table there.
     """
@@ -116,7 +118,9 @@ def library(grip: Grip, home: int, limits: Limits, period: float, grip_axis: Arr
     return [m for m in made if m is not None]
 
 
-def _motion(name: str, home: int, legs: list[tuple[Path, float]], grip: Grip, limits: Limits, period: float) -> Motion | None:
+def _motion(
+    name: str, home: int, legs: list[tuple[Path, float]], grip: Grip, limits: Limits, period: float
+) -> Motion | None:
     """The legs one after the other, then at rest until LONGEST; None: too small to be worth it."""
     frames = round(LONGEST / period)
     shift, turn = np.zeros((frames, 3)), np.zeros((frames, 3))

@@ -8,46 +8,28 @@ tell the causes apart only by luck: whips and coils, where anything small decide
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
+from pred_core.diagnose.apart import THINNED, Rival, Rolled, Separation, roll, separation
+from pred_core.diagnose.chosen import chosen_of
 from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.motions import LONGEST, Limits, Motion, library, limits_of
 from pred_core.diagnose.result import Diagnosis
 from pred_core.diagnose.said import NAMES
 from pred_core.diagnose.standing_start import SETTLE, Start, starts_of
-from pred_core.diagnose.weigh import CHAOS, START
-from pred_core.identify.space import Candidate
-from pred_core.springmass import SpringMass
 from pred_core.twin import Twin
-from pred_core.types import Array, Episode, Grip, State
+from pred_core.types import Array, Episode, Grip
 
 NEAR = 0.02  # probability of a runner-up from which it is a rival
 WIDE = 1.0  # width of a 90 % interval over the value from which a single cause's strength is in question
-DRAWS = 3  # perturbed starts
-KNOWN = 0.05  # relative standard deviation of the base's parameters
-UNSURE = ("stiffness", "ground_friction", "bending_stiffness")  # of them
 NORMAL = 1.645  # standard deviations of half a 90 % interval
 STEP = 0.05  # least coordinate step of a slope
 SPACING = 0.05  # [s] between the points of the plan
-THINNED = 2  # frames between those compared
-
-
-@dataclass(frozen=True)
-class Rival:
-    """A cause with its values, and the same one standard deviation off in each of its strengths."""
-
-    id: str
-    family: str
-    values: Mapping[str, float]
-    candidate: Candidate
-    shifted: tuple[tuple[Candidate, float], ...] = ()  # (point, standard deviations it is off)
 
 
 def propose(answer: Diagnosis, episodes: Sequence[Episode], seed: int = 0) -> dict[str, Any] | None:
@@ -60,27 +42,23 @@ def propose(answer: Diagnosis, episodes: Sequence[Episode], seed: int = 0) -> di
     mine = [e for e in episodes if e.split != "ood"]
     if pair is None or not mine or not mine[0].grips.position.shape[1]:
         return None
-    found = choose(answer.base_twin, pair, mine, max(answer.gate.sigma, 1e-5), seed)
-    return None if found is None else {**found, "rivals": [_plain(r) for r in pair]}
+    return choose(answer.base_twin, pair, mine, max(answer.gate.sigma, 1e-5), seed)
 
 
 def rivals_of(answer: Diagnosis) -> tuple[Rival, Rival] | None:
     """The named cause and its strongest rival: of its group, else the runner-up, else itself at both ends of a wide
     interval; None: there is no rival."""
-    named = {c.id: c for c in answer.causes if not c.measured}
-    for number, seen in enumerate(answer.rounds):
-        by_id = {j.trial.id: j for j, _, _ in seen.judged}
-        chosen = next((j for j, _, why in seen.judged if not why and set(j.trial.ids) <= set(named)), None)
+    named = {c.id: c for c in answer.causes}
+    for number, (seen, chosen) in enumerate(zip(answer.rounds, chosen_of(answer.rounds, answer.causes), strict=True)):
         if chosen is None:
             continue
-        group = [g for g in named[chosen.trial.ids[0]].group if g in by_id]
-        likely = [r.id for r in answer.ranking if r.probability >= NEAR and r.id in by_id] if number == 0 else []
-        others = [i for i in (*group, *likely) if i != chosen.trial.id]
-        if others:
-            return _rival(chosen), _rival(by_id[others[0]])
-        both = _ends(chosen)
-        if both is not None:
-            return both
+        by_id = {j.trial.id: j for j, _, _ in seen.judged}
+        group = named[chosen.trial.ids[0]].group
+        likely = [r.id for r in answer.ranking if r.probability >= NEAR] if number == 0 else []
+        others = [i for i in (*group, *likely) if i in by_id and i != chosen.trial.id]
+        pair = (_rival(chosen), _rival(by_id[others[0]])) if others else _ends(chosen)
+        if pair is not None:
+            return pair
     return None
 
 
@@ -114,166 +92,91 @@ def _ends(j: Judged) -> tuple[Rival, Rival] | None:
     return ends[0], ends[1]
 
 
+@dataclass(frozen=True)
+class Tried:
+    """All motions of the library with what two rivals do in them."""
+
+    motions: tuple[Motion, ...]
+    starts: tuple[Start, ...]
+    limits: tuple[Limits, ...]  # of each start
+    first: Rolled
+    second: Rolled
+    separation: Separation
+
+    @property
+    def apart(self) -> Array:
+        """(M, K, F) [mm] between the rivals' free particles."""
+        free = (self.starts[0].state.held < 0).numpy()
+        return np.asarray(1e3 * np.linalg.norm(self.separation.remaining[:, :, free], axis=-1))
+
+
 def choose(
     twin: Twin, pair: tuple[Rival, Rival], episodes: Sequence[Episode], sigma: float, seed: int
 ) -> dict[str, Any] | None:
-    """The best motion of the library for two rivals, as plain values. `sigma` [m] noise of the tracks."""
-    starts = starts_of(twin, episodes)
-    motions: list[Motion] = []
-    limits = []
-    for home, start in enumerate(starts):
-        limits.append(limits_of([e for e in episodes if e.name in start.like]))
-        motions += library(start.grip, home, limits[home], twin.meta.period, start.axis, start.over, start.touches)
-    if not any(not m.name.startswith("rest") for m in motions):
-        return None
-    generator = torch.Generator().manual_seed(seed)
-    a, b = (roll(twin, r, starts, motions, sigma, generator.manual_seed(seed)) for r in pair)
-    free = starts[0].state.held < 0
-    distances, remaining = separation(a, b, sigma, free)
-    best = int(distances.argmax())
-    return _told(twin, motions, best, distances, remaining, a, b, pair, starts, limits, free)
+    """The best motion of the library for two rivals, as plain values; None: there is no room to move.
 
-
-@dataclass(frozen=True)
-class Rolled:
-    """One rival over all motions."""
-
-    position: Tensor  # (M, K, N, 3) [m]
-    slopes: Tensor  # (P, M, K, N, 3) [m] a standard deviation of each strength
-    spread: Tensor  # (M, K, N) [m^2] of perturbed starts and base parameters, a coordinate
-
-
-def roll(
-    twin: Twin, rival: Rival, starts: Sequence[Start], motions: Sequence[Motion], sigma: float, generator: torch.Generator
-) -> Rolled:
-    """The rival, itself with shifted strengths, and perturbed, each settled where the motion begins."""
-    shaken = [_shaken(rival.candidate, generator) for _ in range(DRAWS)]
-    points = [rival.candidate, *(c for c, _ in rival.shifted), *shaken]
-    homes, count = len(starts), len(motions)
-    settled = _settled(twin, points, starts)
-    home = torch.tensor([p * homes + m.home for p in range(len(points)) for m in motions])
-    state = State(settled.position[home], settled.velocity[home], settled.held[home],
-                  {k: v[home] for k, v in settled.memory.items()})  # fmt: skip
-    loose = (state.held < 0)[..., None].clone()
-    loose[: (len(points) - DRAWS) * count] = False
-    noise = [torch.randn(state.position.shape, generator=generator) * loose * START * sigma for _ in range(2)]
-    state = state.replace(position=state.position + noise[0], velocity=state.velocity + 0.3 * noise[1] / twin.meta.period)
-    grips = [torch.as_tensor(np.stack([v for v in column], axis=1)).float().repeat(1, len(points), 1, 1)
-             for column in ([m.position for m in motions], [m.rotation for m in motions])]  # fmt: skip
-    closed = starts[0].grip.closed.expand(*grips[0].shape[:-1])
-    simulator = _simulator(twin, points, count)
-    raw = simulator.rollout(state, Grip(grips[0], grips[1], closed))[THINNED - 1 :: THINNED]
-    x = raw.unflatten(1, (len(points), count)).permute(1, 2, 0, 3, 4)  # (points, M, K, N, 3)
-    strengths = len(rival.shifted)
-    scale = torch.tensor([s for _, s in rival.shifted]).reshape(-1, 1, 1, 1, 1)
-    spread = (x[1 + strengths :] - x[0]).square().mean(dim=(0, -1))
-    return Rolled(x[0], (x[1 : 1 + strengths] - x[0]) / scale, spread)
-
-
-def _shaken(candidate: Candidate, generator: torch.Generator) -> Candidate:
-    """With the base's parameters off by what is not known of them."""
-    factor = torch.exp(KNOWN * torch.randn(len(UNSURE), generator=generator)).tolist()
-    values = {name: getattr(candidate.physics, name) * f for name, f in zip(UNSURE, factor, strict=True)}
-    return dataclasses.replace(candidate, physics=dataclasses.replace(candidate.physics, **values))
-
-
-def _settled(twin: Twin, points: Sequence[Candidate], starts: Sequence[Start]) -> State:
-    """Each point at each start, at rest after SETTLE with the grippers still."""
-    many = len(points)
-    state = State(*(torch.cat([getattr(s.state, f)[None] for s in starts] * many) for f in ("position", "velocity", "held")))
-    grip = Grip(*(torch.cat([getattr(s.grip, f)[None] for s in starts] * many) for f in ("position", "rotation", "closed")))
-    simulator = _simulator(twin, points, len(starts))
-    begun = simulator.start(state, grip)
-    memory = {**begun.memory, "time": torch.full_like(begun.memory["time"], max(s.session for s in starts))}
-    frames = max(1, round(SETTLE / twin.meta.period))
-    still = Grip(*(v[None].expand(frames, *v.shape) for v in (grip.position, grip.rotation, grip.closed)))
-    return simulator.rollout_states(begun.replace(memory=memory), still)[1]
-
-
-def _simulator(twin: Twin, points: Sequence[Candidate], each: int) -> SpringMass:
-    extended = any(p.extensions for p in points)
-    return SpringMass(
-        twin.body,
-        [p.physics for p in points for _ in range(each)],
-        twin.scene,
-        period=twin.meta.period,
-        extensions=[p.extensions for p in points for _ in range(each)] if extended else (),
-        diverged_as_nan=True,
-    )
-
-
-def separation(a: Rolled, b: Rolled, sigma: float, free: Tensor) -> tuple[Array, Array]:
-    """(M,) distances in standard deviations squared, and (M, K, N, 3) [m] what remains of the difference after the
-    strengths have moved. A motion over which either diverges has distance 0.
+    `sigma` [m] noise of the tracks.
     """
-    d = (a.position - b.position).double()
-    usable = d.flatten(1).isfinite().all(dim=1)
-    spread = 0.5 * (a.spread + b.spread).double()
-    variance = sigma**2 + CHAOS * torch.where(spread.isfinite(), spread, torch.inf)  # what may diverge tells nothing
-    weight = (free.double() / variance)[..., None]  # (M, K, N, 1)
-    slopes = torch.cat((-a.slopes, b.slopes)).double()  # moving either: d + slopes . delta
-    distances, remaining = np.zeros(len(d)), np.zeros(d.shape)
-    for m in range(len(d)):
-        if not usable[m]:
-            continue
-        j = slopes[:, m].flatten(1)
-        w = weight[m].expand(d[m].shape).flatten()
-        left = d[m].flatten()
-        if len(j) and bool(j.isfinite().all()):
-            h = (j * w) @ j.T + torch.eye(len(j), dtype=torch.float64)
-            delta = -torch.linalg.solve(h, (j * w) @ left)
-            left = left + delta @ j
-            distances[m] = float((w * left.square()).sum() + delta.square().sum())
-        else:
-            distances[m] = float((w * left.square()).sum())
-        remaining[m] = left.reshape(d[m].shape).numpy()
-    return distances, remaining
+    tried = compare(twin, pair, episodes, sigma, seed)
+    return None if tried is None else _told(twin, pair, tried)
 
 
-def _told(
-    twin: Twin,
-    motions: Sequence[Motion],
-    best: int,
-    distances: Array,
-    remaining: Array,
-    a: Rolled,
-    b: Rolled,
-    pair: tuple[Rival, Rival],
-    starts: Sequence[Start],
-    limits: Sequence[Limits],
-    free: Tensor,
-) -> dict[str, Any]:
-    motion = motions[best]
-    start, bound = starts[motion.home], limits[motion.home]
-    apart = 1e3 * np.linalg.norm(remaining[:, :, free.numpy()], axis=-1)  # (M, K, free) [mm]
-    mean = np.sqrt((apart**2).mean(axis=(1, 2)))
+def compare(
+    twin: Twin, pair: tuple[Rival, Rival], episodes: Sequence[Episode], sigma: float, seed: int
+) -> Tried | None:
+    """Both rivals over every motion of the library; None: there is no room to move."""
+    starts = starts_of(twin, episodes)
+    limits = [limits_of([e for e in episodes if e.name in s.like]) for s in starts]
+    motions: list[Motion] = []
+    for home, (s, bound) in enumerate(zip(starts, limits, strict=True)):
+        motions += library(s.grip, home, bound, twin.meta.period, s.axis, s.over, s.touches)
+    if len(motions) == len(starts):  # only rest
+        return None
+    first, second = (roll(twin, r, starts, motions, sigma, torch.Generator().manual_seed(seed)) for r in pair)
+    both = separation(first, second, sigma, starts[0].state.held < 0)
+    return Tried(tuple(motions), tuple(starts), tuple(limits), first, second, both)
+
+
+def _told(twin: Twin, pair: tuple[Rival, Rival], tried: Tried) -> dict[str, Any]:
+    """The best motion and how the others do."""
+    order = np.argsort(-tried.separation.squared)
+    best, apart = int(order[0]), tried.apart
+    mean, sds = np.sqrt((apart**2).mean(axis=(1, 2))), np.sqrt(tried.separation.squared)
+    motion = tried.motions[best]
+    start, bound = tried.starts[motion.home], tried.limits[motion.home]
     widest = int(apart[best].mean(axis=-1).argmax())
-    order = np.argsort(-distances)
-    names = [NAMES.get(r.id, r.id) for r in pair]
+    names = [NAMES.get(r.id, r.id.replace("_", " ")) for r in pair]
     if pair[0].id == pair[1].id:
         names = [f"{n} at the {end} end of its interval" for n, end in zip(names, ("lower", "upper"), strict=True)]
-    middle = float(np.median(mean))
+    why = (
+        f"{names[0]} and {names[1]} are {mean[best]:.1f} mm apart in it (root mean square over free particles and "
+        f"{LONGEST:g} s, after either has taken the strength that looks most like the other), {sds[best]:.0f} standard "
+        f"deviations in all; in the median of the {len(tried.motions)} motions tried, {float(np.median(mean)):.1f} mm"
+    )
     return {
         "name": motion.name,
-        "why": f"{names[0]} and {names[1]} move the object {mean[best]:.1f} mm apart in it (root mean square over free "
-        f"particles and {LONGEST:g} s, after either has taken the strength that looks most like the other), "
-        f"{np.sqrt(distances[best]):.0f} standard deviations in all; the median of {len(motions)} motions tried "
-        f"tells {middle:.1f} mm",
+        "why": why[0].upper() + why[1:],
         "distance_mm": float(mean[best]),
-        "distance_sigma": float(np.sqrt(distances[best])),
+        "distance_sigma": float(sds[best]),
         "tried": [
-            {"name": motions[k].name, "distance_mm": float(mean[k]), "distance_sigma": float(np.sqrt(distances[k]))}
+            {"name": tried.motions[k].name, "distance_mm": float(mean[k]), "distance_sigma": float(sds[k])}
             for k in order
         ],
+        "rivals": [{"id": r.id, "family": r.family, "values": dict(r.values)} for r in pair],
         "start": {"episode": start.episode, "frame": start.frame, "rest_first": SETTLE, "on_table": start.touches},
-        "limits": {"low": bound.low.tolist(), "high": bound.high.tolist(), "speed": bound.speed,
-                   "acceleration": bound.acceleration, "turn_speed": bound.turn_speed},
+        "limits": {
+            "low": bound.low.tolist(),
+            "high": bound.high.tolist(),
+            "speed": bound.speed,
+            "acceleration": bound.acceleration,
+            "turn_speed": bound.turn_speed,
+        },
         "widest": {
             "time": (widest + 1) * THINNED * twin.meta.period,
-            "shapes": [r.position[best, widest].tolist() for r in (a, b)],
+            "shapes": [r.position[best, widest].tolist() for r in (tried.first, tried.second)],
         },
         "trajectory": trajectory(motion, start.grip, twin.meta.period),
-    }  # fmt: skip
+    }
 
 
 def trajectory(motion: Motion, start: Grip, period: float) -> dict[str, Any]:
@@ -301,7 +204,3 @@ def trajectory(motion: Motion, start: Grip, period: float) -> dict[str, Any]:
             for t, k in zip(times, kept, strict=True)
         ],
     }
-
-
-def _plain(r: Rival) -> dict[str, Any]:
-    return {"id": r.id, "family": r.family, "values": dict(r.values)}

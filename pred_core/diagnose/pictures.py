@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.pictures_map import COLORS
 from pred_core.diagnose.result import Errors
 from pred_core.diagnose.rounds import Round
@@ -19,7 +20,7 @@ LEARNED, UNEXPLAINED, FLOOR, OTHER = "#E6B800", "#D55E00", "#b8c0c8", "#7a7a7a"
 MOST_LABELS = 60
 
 
-def evidence(seen: Round, words: dict[str, str], accepted: Sequence[str], seed: int) -> Figure:
+def evidence(seen: Round, words: dict[str, str], named: Judged | None, seed: int) -> Figure:
     """What each fitted candidate saves on episodes it did not see, as share of the excess; dots are episodes."""
     judged = sorted((j for j, _, _ in seen.judged), key=lambda j: j.mean)
     excess = max(float(seen.base.mean()) - seen.floor, 1e-9)
@@ -29,7 +30,7 @@ def evidence(seen: Round, words: dict[str, str], accepted: Sequence[str], seed: 
     axes.axvline(100.0, color=GREY, linewidth=0.9, linestyle=":")
     for n, j in enumerate(judged):
         gain = 100.0 * j.gain / excess
-        color = COLORS["extended"] if j.trial.id in accepted else GREY
+        color = COLORS["extended"] if j is named else GREY
         axes.scatter(gain, np.full(len(gain), n), s=9, color=color, alpha=0.35, linewidths=0)
         low, high = (gain[0], gain[0]) if len(gain) < 2 else bootstrap_interval(gain, np.random.default_rng(seed))
         axes.plot((low, high), (n, n), color=color, linewidth=2.2, solid_capstyle="butt")

@@ -43,7 +43,8 @@ def add_next_motion(page: Page, d: Diagnosis) -> None:
         + f"It begins at the pose of {begin['episode']}, frame {begin['frame']}, after the object has rested there for "
         f"{begin['rest_first']:g} s, and stays within what the recordings showed: {bound['speed']:.2f} m/s, "
         f"{bound['acceleration']:.1f} m/s^2, {bound['turn_speed']:.2f} rad/s and their box. Ranked by the distance in "
-        "standard deviations of track noise and of what small changes of start and base do. As a plan: next_motion.yaml.",
+        "standard deviations of track noise and of what small changes of start and base do. As a plan: "
+        "next_motion.yaml.",
         note=True,
     )
 
@@ -51,8 +52,9 @@ def add_next_motion(page: Page, d: Diagnosis) -> None:
 def _caption(motion: Mapping[str, Any]) -> str:
     a, b = _labels(motion)
     return (
-        f"Left: the grippers' way (dot: start) and the object as {a} and {b} predict it {motion['widest']['time']:.2f} s "
-        "after the start, where they are farthest apart. Right: the grippers over time."
+        f"Left: the grippers' way (dot: start) and the object as {a} and {b} predict it "
+        f"{motion['widest']['time']:.2f} s after the start, where they are farthest apart. "
+        "Right: the grippers over time."
     )
 
 
@@ -67,7 +69,7 @@ def _picture(motion: Mapping[str, Any], line: bool) -> Figure:
     times, way = _way(motion["trajectory"])
     shapes = [np.array(s) for s in motion["widest"]["shapes"]]
     figure = Figure(figsize=(13, 3.7), layout="constrained")
-    grid = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1.15))
+    grid = figure.subplots(1, 4)
     for axes, (view, a, b) in zip(grid[:3], VIEWS, strict=True):
         for shape, color, label in zip(shapes, RIVALS, _labels(motion), strict=True):
             axes.plot(shape[:, a], shape[:, b], "o-" if line else ".", color=color, markersize=2.5, label=label)

@@ -6,8 +6,10 @@ import re
 from collections.abc import Mapping, Sequence
 
 from pred_core.diagnose import pictures
+from pred_core.diagnose.chosen import chosen_of
+from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.gate_result import GateCause
-from pred_core.diagnose.result import Cause, Diagnosis, Errors
+from pred_core.diagnose.result import Diagnosis, Errors
 from pred_core.diagnose.rounds import Round
 from pred_core.diagnose.said import NAMES
 from pred_core.effects import find_effect
@@ -28,8 +30,11 @@ def summary(page: Page, d: Diagnosis) -> None:
     for c in d.causes:
         for n, (name, v) in enumerate(c.parameters.items()):
             edge = " (at its bound)" if v.at_bound else ""
-            first = (words(c.id), f"{c.probability:.2f}", "sensor" if c.measured else "physics") if n == 0 else ("", "", "")
-            rows.append((*first, name, f"{number(v.value)} {v.unit}{edge}", f"{number(v.low)} to {number(v.high)}"))
+            kind = "sensor" if c.measured else "physics"
+            first = (words(c.id), f"{c.probability:.2f}", kind) if n == 0 else ("", "", "")
+            unit = "" if v.unit == "1" else f" {v.unit}"
+            span = f"{number(v.low)} to {number(v.high)}"
+            rows.append((*first, name, f"{number(v.value)}{unit}{edge}", span))
     if rows:
         page.table(("cause", "probability", "kind", "parameter", "value", "90 % interval"), rows)
     page.table(
@@ -55,40 +60,51 @@ def add_evidence(page: Page, d: Diagnosis) -> None:
     """Every candidate with what it saves and why it is not named, round by round."""
     page.heading("Evidence: what explains it, and what does not")
     page.text(
-        "A candidate is fitted on the train episodes and judged on episodes it did not see. 100 % is the mean excess of "
-        "the base over what the reference leaves (without a reference: over nothing). Dots are episodes, bars 95 %.",
+        "A candidate is fitted on the train episodes and judged on episodes it did not see. 100 % is the mean excess "
+        "of the base over what the reference leaves (without a reference: over nothing). Dots are episodes, bars 95 %.",
         note=True,
     )
     if not d.rounds:
         page.text("No candidate was tried.")
-    for n, seen in enumerate(d.rounds):
+    chosen = chosen_of(d.rounds, d.causes)
+    for n, (seen, named) in enumerate(zip(d.rounds, chosen, strict=True)):
         if not seen.judged:
             continue
-        accepted = [j.trial.id for j, _, why in seen.judged if not why and _is_named(j.trial.id, d.causes)]
         ids = {j.trial.id: words(j.trial.id) for j, _, _ in seen.judged}
         after = "" if n == 0 else " (after what was named before)"
-        page.figure(pictures.evidence(seen, ids, accepted, d.seed), f"Round {n + 1}{after}. Green: named.")
-        _ranking_table(page, d) if n == 0 else _round_table(page, seen)
+        green = "nothing is named" if named is None else f"green: named, {words(named.trial.id)}"
+        page.figure(pictures.evidence(seen, ids, named, d.seed), f"Round {n + 1}{after}; {green}.")
+        _round_table(page, d, n, named)
         _only_screened(page, seen)
 
 
-def _is_named(id: str, causes: Sequence[Cause]) -> bool:
-    return set(id.split("+")) <= {c.id for c in causes}
-
-
-def _ranking_table(page: Page, d: Diagnosis) -> None:
+def _round_table(page: Page, d: Diagnosis, n: int, named: Judged | None) -> None:
+    """All candidates fitted in a round; in the first also their probabilities, with "unknown" and "nothing"."""
+    seen = d.rounds[n]
+    excess = max(float(seen.base.mean()) - seen.floor, 1e-9)
+    probability = {r.id: f"{r.probability:.2f}" for r in d.ranking} if n == 0 else {}
+    ids = [j.trial.id for j, _, _ in seen.judged]
     rows, marks = [], []
-    named = {c.id for c in d.causes}
-    for r in d.ranking:
-        special = r.id in ("unknown", "none")
-        p = "–" if special else f"{r.p_adjusted:.2g}"
-        gain = "–" if special else f"{100 * r.gain:.0f} %"
-        label = {"unknown": "something not in the library", "none": "nothing"}.get(r.id) or words(r.id)
-        is_named = r.id in named
-        why = _in_words(r.rejected, [other.id for other in d.ranking]) or ("named" if is_named else "")
-        rows.append((label, r.family, f"{r.probability:.2f}", gain, p, _values(r.values), why))
-        marks.append("strong" if is_named else "")
+    for j, q, why in sorted(seen.judged, key=lambda row: (row[0] is not named, -row[0].mean)):
+        verdict = "named" if j is named else _in_words(why, ids) or _beaten(j, named, d)
+        share, likely = f"{100 * j.mean / excess:.0f} %", probability.get(j.trial.id, "–")
+        rows.append((words(j.trial.id), j.trial.family, likely, share, f"{q:.2g}", _values(j.values), verdict))
+        marks.append("strong" if j is named else "")
+    for id, label in (("unknown", "something not in the library"), ("none", "nothing")):
+        if id in probability:
+            rows.append((label, "", probability[id], "–", "–", "", ""))
+            marks.append("")
     page.table(("candidate", "family", "probability", "saves", "p adjusted", "fitted", "verdict"), rows, marks)
+
+
+def _beaten(j: Judged, named: Judged | None, d: Diagnosis) -> str:
+    """Why a candidate that passes every test is not the one."""
+    if named is None:
+        return "part of a pair that explains too little"
+    group = next(c.group for c in d.causes if c.id == named.trial.ids[0])
+    if j.trial.id in group:
+        return f"these data do not tell it apart from {words(named.trial.id)}"
+    return f"saves less than {words(named.trial.id)}"
 
 
 def _in_words(text: str, ids: Sequence[str]) -> str:
@@ -96,16 +112,6 @@ def _in_words(text: str, ids: Sequence[str]) -> str:
     for id in sorted(ids, key=len, reverse=True):
         text = re.sub(rf"\b{re.escape(id)}\b", words(id), text)
     return text
-
-
-def _round_table(page: Page, seen: Round) -> None:
-    excess = max(float(seen.base.mean()) - seen.floor, 1e-9)
-    rows = [
-        (words(j.trial.id), j.trial.family, f"{100 * j.mean / excess:.0f} %", f"{q:.2g}", _values(j.values),
-         why or "accepted")
-        for j, q, why in seen.judged
-    ]  # fmt: skip
-    page.table(("candidate", "family", "saves", "p adjusted", "fitted", "verdict"), rows)
 
 
 def _values(values: Mapping[str, float]) -> str:
@@ -140,7 +146,8 @@ def add_budget(page: Page, d: Diagnosis) -> None:
     """One stacked bar and its numbers."""
     page.heading("Error budget")
     rows, total = budget_rows(d), d.errors.base.mean
-    page.figure(pictures.budget_bar(rows), f"Where the {total:.1f} mm of the base come from ({d.errors.split} episodes).")
+    what = f"Where the {total:.1f} mm of the base come from ({d.errors.split} episodes)."
+    page.figure(pictures.budget_bar(rows), what)
     table = [(name, f"{mm:.2f}", f"{100 * mm / total:.0f} %" if total > 0 else "–") for name, mm, _ in rows]
     table = [row for row, (_, mm, _) in zip(table, rows, strict=True) if mm != 0.0]
     page.table(("part", "mm", "share"), [*table, ("sum = base", f"{sum(v for _, v, _ in rows):.2f}", "100 %")],
@@ -203,8 +210,8 @@ def add_network(page: Page, network: Network | None) -> None:
     page.heading("With and without a network")
     if network is None:
         page.text(
-            "No network is part of this answer: it is trained on the extended twin after the causes are named, so that it "
-            "cannot hide them. Base and extended, each with and without one, are compared by:"
+            "No network is part of this answer: it is trained on the extended twin after the causes are named, so that "
+            "it cannot hide them. Base and extended, each with and without one, are compared by:"
         )
         page.code("pred train DATASET --twin DIR/twin")
         page.code("pred evaluate DATASET --twin DIR/twin --out EVALUATION")

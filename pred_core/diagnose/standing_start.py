@@ -35,7 +35,7 @@ class Start:
 
 
 def starts_of(twin: Twin, episodes: Sequence[Episode]) -> list[Start]:
-    """The calmest complete frame near the middle of the workspace, one in the air and one on the table, where there are.
+    """The calmest complete frame near the middle of the workspace: one in the air and one on the table, if there are.
 
     Only episodes that hold what the first one holds. Raises: DatasetError if the tracks are not of this twin.
     """
@@ -61,7 +61,9 @@ def _lying(twin: Twin, r: Recording) -> float:
     return float((height[torch.isfinite(height)] < TOUCHING).double().mean())
 
 
-def _calmest(e: Episode, r: Recording, kind: Sequence[tuple[Episode, Recording]]) -> tuple[float, Episode, Recording, int]:
+def _calmest(
+    e: Episode, r: Recording, kind: Sequence[tuple[Episode, Recording]]
+) -> tuple[float, Episode, Recording, int]:
     """(score, episode, recording, frame): speed of the object over its usual one, and distance to the middle."""
     places = torch.cat([o.grips.position.reshape(-1, 3) for _, o in kind])
     middle = (places.amax(dim=0) + places.amin(dim=0)) / 2

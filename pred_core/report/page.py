@@ -20,7 +20,7 @@ th, td { padding: .25em .8em; text-align: right; border-bottom: 1px solid #e4e7e
 th { border-bottom: 2px solid #57606a; font-weight: 600; } th:first-child, td:first-child { text-align: left; }
 tr.strong td { font-weight: 650; } tr.warn td { color: #9a3b00; }
 figure { margin: 1em 0; } img { max-width: 100%; } code { background: #f2f4f6; padding: .1em .3em; }
-.wide { overflow-x: auto; }
+.wide { overflow-x: auto; } p.lead { font-size: 1.2em; line-height: 1.45; margin: .8em 0 1em; }
 """
 
 
@@ -38,6 +38,10 @@ class Page:
     def text(self, text: str, note: bool = False) -> None:
         """A paragraph; `note`: small and grey."""
         self._parts.append(f"<p{' class=note' if note else ''}>{html.escape(text)}</p>")
+
+    def lead(self, text: str) -> None:
+        """The sentence a page opens with, larger."""
+        self._parts.append(f"<p class=lead>{html.escape(text)}</p>")
 
     def code(self, text: str) -> None:
         """A command line."""

@@ -1,0 +1,37 @@
+"""A plan of gripper poses from a file: `next_motion.yaml` of `pred diagnose`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pred_core.arm.follower import Plan, make_plan
+from pred_core.arm.limits import GuardConfig
+from pred_core.config import load_yaml
+from pred_core.errors import ConfigError
+
+
+def load_plan(path: Path, start: int, config: GuardConfig, gripper: int = 0) -> Plan:
+    """The motion of one gripper, beginning at `start` [ns]. The arm must be at its first pose by then.
+
+    Raises: ConfigError if the file has another layout, InputError for a plan that cannot be followed within `config`.
+    """
+    values = load_yaml(path)
+    try:
+        trajectory: dict[str, Any] = values["trajectory"]
+        points = trajectory["points"]
+        times = [float(p["time_from_start"]) for p in points]
+        transforms = [p["transforms"][gripper] for p in points]
+        position = np.array([t["translation"] for t in transforms], dtype=float)
+        rotation = np.array([t["rotation"] for t in transforms], dtype=float)
+        frame = str(trajectory["frame_id"])
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"{path}: not a motion",
+            got=repr(error),
+            allowed="trajectory: frame_id, points of time_from_start and transforms",
+            next_step="Give the next_motion.yaml of pred diagnose",
+        ) from error
+    return make_plan(start, frame, times, position, rotation, config)
