@@ -4,10 +4,15 @@
         draw the final cases, simulate them, identify one twin per reference, diagnose; goes on where it stopped
     python benchmarks/hidden_effects.py score --work out/hidden
         the table in markdown, and scores.json in the work folder
+    ... oracle --work out/hidden          ... baselines --work out/hidden
+        what could be avoided at most, and what simpler ways would have answered: `score` then shows them too
+    ... run --placebos    ... score --placebos
+        six laws that nothing obeys among the candidates; answers in WORK/out_placebos
     ... --set dev
         the development cases, on which everything was chosen; other seeds, other folder
 
-A case's data stand in WORK/<name>, its truth beside it, its diagnosis in WORK/out/<name>.
+A case's data stand in WORK/<name>, its truth beside it, its diagnosis in WORK/out/<name>. Everything is kept that is
+there already.
 """
 
 from __future__ import annotations
@@ -16,7 +21,6 @@ import argparse
 import json
 import os
 import shlex
-import statistics
 import subprocess
 import sys
 import time
@@ -24,14 +28,21 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+from hidden_bench import pieces
 from hidden_cases import Case, Release, release, simulate
+from hidden_scores import Judgement, judged
+from hidden_table import compare, markdown, scores
 
 from pred_core.plant.case import truth_path
 
 IDENTIFY = shlex.split(
     "--parameters stiffness,damping,ground_friction,bending_stiffness --effects bending_damping --restarts 2"
 )
+PRED = ("-m", "pred_core.cli.main")
+HERE = Path(__file__).parent
+ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 
 
 def main() -> int:
@@ -45,17 +56,25 @@ def _arguments() -> argparse.Namespace:
     commands = parser.add_subparsers(dest="command", required=True)
     run = commands.add_parser("run", help="simulate, identify and diagnose")
     run.set_defaults(act=run_cases)
-    run.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at once")
-    run.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these cases")
     run.add_argument("--flags", default="", help="more flags for pred diagnose, in one string")
     score = commands.add_parser("score", help="score the diagnoses that are there")
     score.set_defaults(act=score_cases)
-    score.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these cases")
+    least = commands.add_parser("oracle", help="fit the true law of every case that has one")
+    least.set_defaults(act=run_oracle)
+    simple = commands.add_parser("baselines", help="answers of simpler ways")
+    simple.set_defaults(act=run_baselines)
+    for command in (run, least, simple):
+        command.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at once")
     for command in (run, score):
+        command.add_argument("--placebos", action="store_true", help="with laws that nothing obeys")
+    for command in (run, score, least, simple):
+        command.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these cases")
         command.add_argument("--work", type=Path, required=True, metavar="DIR", help="where everything stands")
-        command.add_argument("--out", default="out", help="folder of the answers in the work folder")
+        command.add_argument("--out", default="", help="folder of the answers in the work folder (out)")
         command.add_argument("--set", choices=("final", "dev"), default="final", help="which cases")
-    return parser.parse_args()
+    args = parser.parse_args()
+    args.out = args.out or ("out_placebos" if getattr(args, "placebos", False) else "out")
+    return args
 
 
 def chosen(drawn: Release, only: Sequence[str]) -> list[Case]:
@@ -96,20 +115,21 @@ def _identify(work: Path, seeds: Mapping[str, int], name: str) -> int:
 def _diagnose(args: argparse.Namespace, cases: Mapping[str, Case], name: str) -> int:
     case, work, out = cases[name], args.work, args.work / args.out / name
     simulate(work / case.name, case.hidden, case.seed)
+    program = [str(HERE / "hidden_placebos.py")] if args.placebos else PRED
     words = ["diagnose", str(work / case.name), "--twin", str(_twin(work, case.reference)), "--reference",
              str(work / case.reference), "--out", str(out), *shlex.split(args.flags)]  # fmt: skip
-    return _pred(words, work / args.out / f"{case.name}.log")
+    return _pred(words, work / args.out / f"{case.name}.log", program)
 
 
-def _pred(words: Sequence[str], log: Path) -> int:
+def _pred(words: Sequence[str], log: Path, program: Sequence[str] = PRED) -> int:
     """Exit code of one `pred` command on one thread, its words in a log."""
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w", encoding="utf-8") as stream:
         stream.write("pred " + shlex.join(words) + "\n")
         stream.flush()
         return subprocess.run(
-            [sys.executable, "-m", "pred_core.cli.main", *words], stdout=stream, stderr=subprocess.STDOUT,
-            env={**os.environ, "OMP_NUM_THREADS": "1"}, check=False,
+            [sys.executable, *program, *words], stdout=stream, stderr=subprocess.STDOUT,
+            env={**os.environ, **ONE_THREAD}, check=False,
         ).returncode  # fmt: skip
 
 
@@ -130,49 +150,86 @@ def _all(what: str, names: Sequence[str], jobs: int, do: Callable[[str], int]) -
     return failed
 
 
+def run_oracle(args: argparse.Namespace) -> int:
+    """Oracles that are missing. Returns 1 if one failed."""
+    from hidden_oracle import has_oracle
+
+    return _beside(args, "oracle", [c for c in chosen(release(args.set), args.only) if has_oracle(c)])
+
+
+def run_baselines(args: argparse.Namespace) -> int:
+    """Baselines that are missing. Returns 1 if one failed."""
+    return _beside(args, "baselines", chosen(release(args.set), args.only))
+
+
+def _beside(args: argparse.Namespace, what: str, cases: Sequence[Case]) -> int:
+    """Something of every case that has been diagnosed, as WORK/<what>/<name>.json."""
+    os.environ.update(ONE_THREAD)
+    todo = {c.name: c for c in cases if (args.work / args.out / c.name / "diagnosis.json").exists()
+            and not (args.work / what / f"{c.name}.json").exists()}  # fmt: skip
+    return 1 if _all(what, list(todo), args.jobs, partial(_one_beside, args, what, todo)) else 0
+
+
+def _one_beside(args: argparse.Namespace, what: str, cases: Mapping[str, Case], name: str) -> int:
+    import torch
+    from hidden_baselines import baselines
+    from hidden_oracle import oracle
+
+    torch.set_num_threads(1)
+    case, work = cases[name], args.work
+    make = oracle if what == "oracle" else baselines
+    result = make(case, work, _twin(work, case.reference), work / args.out / name)
+    path = work / what / f"{name}.json"
+    path.parent.mkdir(exist_ok=True)
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    part.replace(path)
+    return 0
+
+
 def score_cases(args: argparse.Namespace) -> int:
     """The table of what has been diagnosed."""
-    from hidden_scores import judged
-    from hidden_table import markdown, scores
-
     drawn = release(args.set)
-    rows, missing = [], []
+    rows: list[Judgement] = []
+    simple: dict[str, list[Judgement]] = {}
+    missing = []
     for case in chosen(drawn, args.only):
         path = args.work / args.out / case.name / "diagnosis.json"
         if not path.exists():
             missing.append(case.name)
             continue
-        answer = json.loads(path.read_text(encoding="utf-8"))
-        truth = json.loads(truth_path(args.work / case.name).read_text(encoding="utf-8"))
-        hidden = tuple((h["effect"], float(h["magnitude"])) for h in truth["hidden"])
-        if hidden != case.hidden or truth["seed"] != case.seed:
-            sys.exit(f"{case.name}: the truth beside it is of another case; use another work folder")
-        oracle = args.work / "oracle" / f"{case.name}.json"
-        rows.append(
-            judged(case.name, case.reference, hidden, answer, base=_base(path.parent),
-                   oracle=json.loads(oracle.read_text(encoding="utf-8")) if oracle.exists() else None)
-        )  # fmt: skip
+        _check_truth(args.work, case)
+        rows.append(judged(case.name, case.reference, case.hidden, _json(path), base=_base(path.parent),
+                           oracle=_json(args.work / "oracle" / f"{case.name}.json")))  # fmt: skip
+        for method, answer in (_json(args.work / "baselines" / f"{case.name}.json") or {}).items():
+            simple.setdefault(method, []).append(judged(case.name, case.reference, case.hidden, answer, {}, None))
     if not rows:
         sys.exit(f"no diagnosis in {args.work / args.out}: run the cases first")
-    result = scores(rows)
+    result = scores(rows, placebos=args.placebos)
+    if simple:
+        result["baselines"] = compare({"diagnosis": rows, **simple})
     print(markdown(result))
-    print(f"\n{len(rows)} cases scored, {len(missing)} without an answer{': ' + ', '.join(missing) if missing else ''};"
-          f" median time {statistics.median(r.seconds for r in rows):.0f} s")  # fmt: skip
+    print(f"\n{len(rows)} cases scored, {len(missing)} without an answer{': ' + ', '.join(missing) if missing else ''}")
     (args.work / args.out / "scores.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     return 0
 
 
-def _base(out: Path) -> dict[str, float]:
+def _json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+
+
+def _check_truth(work: Path, case: Case) -> None:
+    """Stop if the truth beside a data set is not what was drawn."""
+    truth = _json(truth_path(work / case.name))
+    hidden = tuple((h["effect"], float(h["magnitude"])) for h in truth["hidden"])
+    if hidden != case.hidden or truth["seed"] != case.seed:
+        sys.exit(f"{case.name}: the truth beside it is of another case; use another work folder")
+
+
+def _base(answer: Path) -> dict[str, float]:
     """Values of the commissioned twin that some magnitudes are relative to, from the journal."""
-    journal = out / "journal.jsonl"
-    if not journal.exists():
-        return {}
-    for line in journal.read_text(encoding="utf-8").splitlines():
-        entry = json.loads(line)
-        if entry.get("key") == "base":
-            first = entry["value"]["extensions"]
-            return {f"{k}": float(v[0]) for e in first for k, v in e.items()}
-    return {}
+    standing = pieces(answer).get("base", {"extensions": []})["extensions"]
+    return {name: float(values[0]) for effect in standing for name, values in effect.items()}
 
 
 if __name__ == "__main__":

@@ -20,18 +20,19 @@ AVOIDABLE = 0.05  # of the base error: less is nothing to close a share of
 Cell = dict[str, Any]
 Rows = Sequence[Judgement]
 Holds = Callable[[Judgement], bool]
+Metric = tuple[str, str, Callable[[Rows], Cell | None]]
 
 
-def scores(rows: Rows) -> dict[str, Any]:
-    """{"table": [{metric, goal, cells {column: cell}}], "confusion": {truth: {answer: count}}, "cases": [...]}."""
+def scores(rows: Rows, placebos: bool = False) -> dict[str, Any]:
+    """{"table": [{metric, goal, cells {column: cell}}], "confusion": {truth: {answer: count}}, "cases": [...]}.
+
+    `placebos`: laws that nothing obeys were among the candidates; how often one was named is shown.
+    """
     strength = strengths(rows)
     columns = {"all": list(rows)}
     for low, high in BINS:
         columns[_span(low, high)] = [r for r in rows if low <= strength[r.name] < high]
-    table = [
-        {"metric": metric, "goal": goal, "cells": {c: cell(chosen) for c, chosen in columns.items()}}
-        for metric, goal, cell in METRICS
-    ]
+    table = _table(columns, (*METRICS, FAKES) if placebos else METRICS)
     cases = [
         {
             "name": r.name, "reference": r.reference, "kind": r.kind, "hidden": list(r.hidden), "outcome": r.outcome,
@@ -42,6 +43,23 @@ def scores(rows: Rows) -> dict[str, Any]:
         for r in rows
     ]  # fmt: skip
     return {"table": table, "confusion": confusion(rows), "cases": cases}
+
+
+def compare(methods: Mapping[str, Rows]) -> list[dict[str, Any]]:
+    """Rows as in the table: names of several methods on the same cases, all and the strong ones."""
+    columns = {}
+    for method, rows in methods.items():
+        strength = strengths(rows)
+        columns[method] = list(rows)
+        columns[f"{method}, {_span(*BINS[-1])}"] = [r for r in rows if strength[r.name] >= BINS[-1][0]]
+    return _table(columns, METRICS[:COMPARED])
+
+
+def _table(columns: Mapping[str, Rows], metrics: Sequence[Metric]) -> list[dict[str, Any]]:
+    return [
+        {"metric": metric, "goal": goal, "cells": {c: cell(chosen) for c, chosen in columns.items()}}
+        for metric, goal, cell in metrics
+    ]
 
 
 def _span(low: float, high: float) -> str:
@@ -118,7 +136,7 @@ def _no_false(r: Judgement) -> bool:
 
 
 KNOWN = ("single",)
-METRICS: tuple[tuple[str, str, Callable[[Rows], Cell | None]], ...] = (
+METRICS: tuple[Metric, ...] = (
     ("controls: anything but none", "<= 3 %", share(("control",), lambda r: r.outcome != "none")),
     ("controls: something named", "", share(("control",), _named)),
     ("one effect: detected (anything but none)", ">= 95 %", share(KNOWN, lambda r: r.outcome != "none")),
@@ -136,6 +154,7 @@ METRICS: tuple[tuple[str, str, Callable[[Rows], Cell | None]], ...] = (
     ("outside the library: none", "", share(("unlisted",), lambda r: r.outcome == "none")),
     ("two effects: exactly both", ">= 50 %", share(("pair",), lambda r: sorted(r.named) == sorted(r.truths))),
     ("two effects: one or both right, none false", ">= 85 %", share(("pair",), lambda r: _named(r) and _no_false(r))),
+    # The metrics above are of names alone: other ways to a name are compared by them.
     ("parameter error, median", "<= 10 %", number(lambda r: r.parameter_error, 0.5, "%")),
     ("truth in the 90 % interval", "85 to 95 %",
      share(KNOWN, lambda r: bool(r.covered), lambda r: r.covered is not None)),
@@ -151,6 +170,9 @@ METRICS: tuple[tuple[str, str, Callable[[Rows], Cell | None]], ...] = (
     ("time, median", "<= 300 s", number(lambda r: r.seconds, 0.5, "s")),
     ("time, 90th percentile", "", number(lambda r: r.seconds, 0.9, "s")),
 )  # fmt: skip
+COMPARED = next(n for n, (metric, _, _) in enumerate(METRICS) if metric.startswith("parameter error"))
+EVERY = ("control", "single", "unlisted", "pair")
+FAKES: Metric = ("a law that nothing obeys is named", "0", share(EVERY, lambda r: "placebo" in r.families))
 
 
 def confusion(rows: Rows) -> dict[str, dict[str, int]]:
@@ -170,23 +192,29 @@ def confusion(rows: Rows) -> dict[str, dict[str, int]]:
 
 
 def markdown(result: Mapping[str, Any]) -> str:
-    """Table and confusion matrix."""
-    columns = list(result["table"][0]["cells"])
+    """Tables and confusion matrix."""
     lines = [
         "Columns: error of the base over that of the controls of the same reference. 95 % intervals: Clopper-Pearson"
         " for shares, bootstrap over cases for the others.",
         "",
-        _line(["", "goal", *columns]),
-        _line(["---"] * (2 + len(columns))),
+        *_rows(result["table"]),
     ]
-    for row in result["table"]:
-        lines.append(_line([row["metric"], row["goal"], *(_text(row["cells"][c]) for c in columns)]))
+    if "baselines" in result:
+        lines += ["", "The same cases, answered by simpler ways.", "", *_rows(result["baselines"])]
     matrix = result["confusion"]
     answers = sorted({a for line in matrix.values() for a in line})
     lines += ["", "Families: hidden (rows), answered first (columns).", ""]
     lines += [_line(["", *answers]), _line(["---"] * (1 + len(answers)))]
     lines += [_line([truth, *(str(line.get(a, "")) for a in answers)]) for truth, line in matrix.items()]
     return "\n".join(lines)
+
+
+def _rows(table: Sequence[Mapping[str, Any]]) -> list[str]:
+    columns = list(table[0]["cells"])
+    lines = [_line(["", "goal", *columns]), _line(["---"] * (2 + len(columns)))]
+    for row in table:
+        lines.append(_line([row["metric"], row["goal"], *(_text(row["cells"][c]) for c in columns)]))
+    return lines
 
 
 def _line(cells: Sequence[str]) -> str:
