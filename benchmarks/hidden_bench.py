@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pred_core.diagnose.commission import commission
+from pred_core.diagnose.commission import commission, with_stored
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Bench
@@ -32,6 +32,11 @@ def rebuilt(twin: Path, episodes: Sequence[Episode], reference: Sequence[Episode
         journal.known["base"] = known["base"]
     inner = [[e for e in some if e.split != "ood"] for some in (episodes, reference)]
     return commission(plain, inner[0], inner[1], DiagnoseConfig(), _silent, journal)
+
+
+def commissioned(twin: Path, answer: Path) -> Twin:
+    """What a case was compared with: the twin as its refinement on the reference left it."""
+    return with_stored(Twin.load(twin).replace(residual=None), pieces(answer)["base"])
 
 
 def _silent(text: str) -> None:

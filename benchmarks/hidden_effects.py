@@ -4,6 +4,8 @@
         draw the final cases, simulate them, identify one twin per reference, diagnose; goes on where it stopped
     python benchmarks/hidden_effects.py score --work out/hidden
         the table in markdown, and scores.json in the work folder
+    ... paired --work out/hidden
+        the base's error on the same motions with nothing hidden: how strong an effect is; `score` bins by it
     ... oracle --work out/hidden          ... baselines --work out/hidden
         what could be avoided at most, and what simpler ways would have answered: `score` then shows them too
     ... run --placebos    ... score --placebos
@@ -18,6 +20,8 @@ there already.
 from __future__ import annotations
 
 import argparse
+import hashlib
+import importlib
 import json
 import os
 import shlex
@@ -35,6 +39,9 @@ from hidden_cases import Case, Release, release, simulate
 from hidden_scores import Judgement, judged
 from hidden_table import compare, markdown, scores
 
+import pred_core
+from pred_core.cli.main import BAD_INPUT
+from pred_core.errors import PredError
 from pred_core.plant.case import truth_path
 
 IDENTIFY = shlex.split(
@@ -63,11 +70,13 @@ def _arguments() -> argparse.Namespace:
     least.set_defaults(act=run_oracle)
     simple = commands.add_parser("baselines", help="answers of simpler ways")
     simple.set_defaults(act=run_baselines)
-    for command in (run, least, simple):
+    plain = commands.add_parser("paired", help="errors of the base on the same motions with nothing hidden")
+    plain.set_defaults(act=run_paired)
+    for command in (run, least, simple, plain):
         command.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at once")
     for command in (run, score):
         command.add_argument("--placebos", action="store_true", help="with laws that nothing obeys")
-    for command in (run, score, least, simple):
+    for command in (run, score, least, simple, plain):
         command.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these cases")
         command.add_argument("--work", type=Path, required=True, metavar="DIR", help="where everything stands")
         command.add_argument("--out", default="", help="folder of the answers in the work folder (out)")
@@ -115,10 +124,21 @@ def _identify(work: Path, seeds: Mapping[str, int], name: str) -> int:
 def _diagnose(args: argparse.Namespace, cases: Mapping[str, Case], name: str) -> int:
     case, work, out = cases[name], args.work, args.work / args.out / name
     simulate(work / case.name, case.hidden, case.seed)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "code.txt").write_text(_code() + "\n", encoding="utf-8")
     program = [str(HERE / "hidden_placebos.py")] if args.placebos else PRED
     words = ["diagnose", str(work / case.name), "--twin", str(_twin(work, case.reference)), "--reference",
              str(work / case.reference), "--out", str(out), *shlex.split(args.flags)]  # fmt: skip
     return _pred(words, work / args.out / f"{case.name}.log", program)
+
+
+def _code() -> str:
+    """A hash of the code that diagnoses: answers of different code must not be mixed unseen."""
+    digest = hashlib.sha256()
+    root = Path(pred_core.__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def _pred(words: Sequence[str], log: Path, program: Sequence[str] = PRED) -> int:
@@ -140,7 +160,12 @@ def _all(what: str, names: Sequence[str], jobs: int, do: Callable[[str], int]) -
     with ProcessPoolExecutor(max(1, jobs)) as pool:
         running = {pool.submit(do, name): name for name in names}
         for done, future in enumerate(as_completed(running), start=1):
-            name, code = running[future], future.result()
+            name = running[future]
+            try:
+                code = future.result()
+            except PredError as error:
+                print(f"{what} {name}: {error}", flush=True)
+                code = BAD_INPUT
             if code:
                 failed.append(name)
             passed = time.monotonic() - begin
@@ -154,32 +179,36 @@ def run_oracle(args: argparse.Namespace) -> int:
     """Oracles that are missing. Returns 1 if one failed."""
     from hidden_oracle import has_oracle
 
-    return _beside(args, "oracle", [c for c in chosen(release(args.set), args.only) if has_oracle(c)])
+    return _beside(args, [c for c in chosen(release(args.set), args.only) if has_oracle(c)])
 
 
 def run_baselines(args: argparse.Namespace) -> int:
     """Baselines that are missing. Returns 1 if one failed."""
-    return _beside(args, "baselines", chosen(release(args.set), args.only))
+    return _beside(args, chosen(release(args.set), args.only))
 
 
-def _beside(args: argparse.Namespace, what: str, cases: Sequence[Case]) -> int:
-    """Something of every case that has been diagnosed, as WORK/<what>/<name>.json."""
+def run_paired(args: argparse.Namespace) -> int:
+    """Errors without the effects that are missing. Returns 1 if one failed."""
+    return _beside(args, [c for c in chosen(release(args.set), args.only) if c.hidden])
+
+
+def _beside(args: argparse.Namespace, cases: Sequence[Case]) -> int:
+    """What the command makes of every case that has been diagnosed, as WORK/<command>/<name>.json."""
     os.environ.update(ONE_THREAD)
+    what = args.command
     todo = {c.name: c for c in cases if (args.work / args.out / c.name / "diagnosis.json").exists()
             and not (args.work / what / f"{c.name}.json").exists()}  # fmt: skip
-    return 1 if _all(what, list(todo), args.jobs, partial(_one_beside, args, what, todo)) else 0
+    return 1 if _all(what, list(todo), args.jobs, partial(_one_beside, args, todo)) else 0
 
 
-def _one_beside(args: argparse.Namespace, what: str, cases: Mapping[str, Case], name: str) -> int:
+def _one_beside(args: argparse.Namespace, cases: Mapping[str, Case], name: str) -> int:
     import torch
-    from hidden_baselines import baselines
-    from hidden_oracle import oracle
 
     torch.set_num_threads(1)
     case, work = cases[name], args.work
-    make = oracle if what == "oracle" else baselines
+    make = getattr(importlib.import_module(f"hidden_{args.command}"), args.command)
     result = make(case, work, _twin(work, case.reference), work / args.out / name)
-    path = work / what / f"{name}.json"
+    path = work / args.command / f"{name}.json"
     path.parent.mkdir(exist_ok=True)
     part = path.with_suffix(".part")
     part.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
@@ -192,24 +221,29 @@ def score_cases(args: argparse.Namespace) -> int:
     drawn = release(args.set)
     rows: list[Judgement] = []
     simple: dict[str, list[Judgement]] = {}
-    missing = []
+    missing, codes = [], set()
     for case in chosen(drawn, args.only):
         path = args.work / args.out / case.name / "diagnosis.json"
         if not path.exists():
             missing.append(case.name)
             continue
         _check_truth(args.work, case)
+        said_by = path.with_name("code.txt")
+        codes.add(said_by.read_text(encoding="utf-8") if said_by.exists() else "")
         rows.append(judged(case.name, case.reference, case.hidden, _json(path), base=_base(path.parent),
-                           oracle=_json(args.work / "oracle" / f"{case.name}.json")))  # fmt: skip
+                           oracle=_json(args.work / "oracle" / f"{case.name}.json"),
+                           paired=_json(args.work / "paired" / f"{case.name}.json")))  # fmt: skip
         for method, answer in (_json(args.work / "baselines" / f"{case.name}.json") or {}).items():
-            simple.setdefault(method, []).append(judged(case.name, case.reference, case.hidden, answer, {}, None))
+            simple.setdefault(method, []).append(judged(case.name, case.reference, case.hidden, answer, {}, None,
+                                                        _json(args.work / "paired" / f"{case.name}.json")))
     if not rows:
         sys.exit(f"no diagnosis in {args.work / args.out}: run the cases first")
     result = scores(rows, placebos=args.placebos)
     if simple:
         result["baselines"] = compare({"diagnosis": rows, **simple})
     print(markdown(result))
-    print(f"\n{len(rows)} cases scored, {len(missing)} without an answer{': ' + ', '.join(missing) if missing else ''}")
+    print(f"\n{len(rows)} cases scored, {len(missing)} without an answer{': ' + ', '.join(missing) if missing else ''};"
+          f" answers of {len(codes)} version{'s' * (len(codes) > 1)} of the code")  # fmt: skip
     (args.work / args.out / "scores.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     return 0
 

@@ -21,10 +21,10 @@ from pred_core.bag.dataset import load_dataset
 from pred_core.calibration import Calibration
 from pred_core.diagnose.commission import with_values
 from pred_core.diagnose.errors import episode_errors
-from pred_core.diagnose.fit import fit
+from pred_core.diagnose.fit import Fit, fit
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Bench, Effects, rng_of, screen
-from pred_core.diagnose.search import refine_trial
+from pred_core.diagnose.search import Start
 from pred_core.effects import find_effect
 from pred_core.plant.hidden.measurement import camera_place
 from pred_core.types import Array
@@ -66,13 +66,21 @@ def _fitted(bench: Bench, effects: Effects, known: dict[str, Any]) -> Array:
     fits = []
     for restart in range(RESTARTS):
         found = screen(bench, effects, rng_of(restart, f"oracle/{trial.id}"), Journal(None, {}), "screen")
-        fits.append(refine_trial(bench.fitted, trial, found.starts, bench.config.iterations))
+        fits.append(_from_best(bench, effects, found.starts))
         if not any(q.scan for e in effects for q in e.parameters):
             break  # one start only: the others would be the same
     for key in (f"0/fit/{trial.id}", f"0/pair/{trial.id}"):
         if key in known and len(known[key]["z"]) == len(trial.space.knobs):
             fits.append(fit(bench.fitted, trial.space, np.array(known[key]["z"]), bench.config.iterations))
     return min(fits, key=lambda f: float(f.loss.mean())).z
+
+
+def _from_best(bench: Bench, effects: Effects, starts: Sequence[Start]) -> Fit:
+    """The refinement of the start that two steps bring farthest."""
+    space = bench.trial(effects).space
+    short = [fit(bench.fitted, space, s.z, 2) for s in starts] if len(starts) > 1 else []
+    first = min(short, key=lambda f: float(f.loss.mean())).z if short else starts[0].z
+    return fit(bench.fitted, space, first, bench.config.iterations)
 
 
 def _calibration(case: Case) -> Calibration:

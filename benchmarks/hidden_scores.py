@@ -18,7 +18,7 @@ GRAVITY = 9.81  # [m/s^2]
 ROPE_RADIUS = 0.004  # [m], which the library counts into the radius of an obstacle
 LEVEL = 0.95  # of every interval
 RESAMPLED = 4000
-BINS = ((0.0, 1.1), (1.1, 1.3), (1.3, math.inf))  # error of the base over that of the controls
+BINS = ((0.0, 1.1), (1.1, 1.3), (1.3, math.inf))  # error of the base over that with nothing hidden
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,7 @@ class Judgement:
     extended_ood: float | None
     oracle_ood: float | None
     seconds: float
+    paired: float | None = None  # [mm] of the base on the same motions with nothing hidden
 
     @property
     def kind(self) -> str:
@@ -150,8 +151,13 @@ def judged(
     answer: Mapping[str, Any],
     base: Mapping[str, float],
     oracle: Mapping[str, Any] | None,
+    paired: Mapping[str, Any] | None = None,
 ) -> Judgement:
-    """Judge one `diagnosis.json`; `base`: values of the commissioned twin, for magnitudes relative to it."""
+    """Judge one `diagnosis.json`.
+
+    `base`: values of the commissioned twin, for magnitudes relative to it; `oracle`, `paired`: errors of the twin with
+    the true law, and of the base with nothing hidden.
+    """
     causes = _causes(answer) if answer["outcome"] in ("named", "group") else []
     named = tuple(c["id"] for c in causes)
     error, covered = None, None
@@ -168,6 +174,7 @@ def judged(
         oracle=None if oracle is None else oracle["error_mm"],
         base_ood=ood.get("base"), extended_ood=ood.get("extended"),
         oracle_ood=None if oracle is None else oracle["error_mm_ood"], seconds=answer["seconds"],
+        paired=None if paired is None else paired["error_mm"],
     )  # fmt: skip
 
 
@@ -225,12 +232,20 @@ def parameter_error(
 
 
 def strengths(rows: Sequence[Judgement]) -> dict[str, float]:
-    """Case -> error of its base over the mean of its reference's controls; 1 if there is no control at all."""
+    """Case -> error of its base over that without its effects: on the same motions; 1 for a control.
+
+    Where that is not known, over the mean of its reference's controls; 1 if there is no control at all.
+    """
     controls = [r for r in rows if r.kind == "control"]
     result = {}
     for row in rows:
         usual = [c.base for c in controls if c.reference == row.reference] or [c.base for c in controls]
-        result[row.name] = row.base / float(np.mean(usual)) if usual else 1.0
+        if row.kind == "control":
+            result[row.name] = 1.0
+        elif row.paired is not None:
+            result[row.name] = row.base / row.paired
+        else:
+            result[row.name] = row.base / float(np.mean(usual)) if usual else 1.0
     return result
 
 

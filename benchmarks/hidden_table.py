@@ -42,7 +42,10 @@ def scores(rows: Rows, placebos: bool = False) -> dict[str, Any]:
         }
         for r in rows
     ]  # fmt: skip
-    return {"table": table, "confusion": confusion(rows), "cases": cases}
+    known = sum(r.paired is not None for r in rows)
+    others = sum(bool(r.hidden) for r in rows) - known
+    said = f"measured on the same motions for {known} cases and on the reference's controls for {others}"
+    return {"table": table, "confusion": confusion(rows), "cases": cases, "strength": said}
 
 
 def compare(methods: Mapping[str, Rows]) -> list[dict[str, Any]]:
@@ -194,8 +197,8 @@ def confusion(rows: Rows) -> dict[str, dict[str, int]]:
 def markdown(result: Mapping[str, Any]) -> str:
     """Tables and confusion matrix."""
     lines = [
-        "Columns: error of the base over that of the controls of the same reference. 95 % intervals: Clopper-Pearson"
-        " for shares, bootstrap over cases for the others.",
+        f"Columns: error of the base over that with nothing hidden, {result['strength']}. 95 % intervals:"
+        " Clopper-Pearson for shares, bootstrap over cases for the others.",
         "",
         *_rows(result["table"]),
     ]

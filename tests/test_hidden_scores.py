@@ -64,7 +64,7 @@ def answer(
 def judge(bench: dict[str, ModuleType], hidden: Sequence[tuple[str, float]], said: dict[str, Any], **more: Any) -> Any:
     name = more.pop("name", "case1")
     return bench["hidden_scores"].judged(
-        name, "ref1", tuple(hidden), said, more.get("commissioned", {}), more.get("oracle")
+        name, "ref1", tuple(hidden), said, more.get("commissioned", {}), more.get("oracle"), more.get("paired")
     )
 
 
@@ -165,9 +165,18 @@ def test_strength_is_measured_by_the_controls_of_the_same_reference(bench: dict[
         judge(bench, [("wind", 4.0)], answer("none", base=12.0), name="w"),
         judge(bench, [("wind", 9.0)], answer("named", ("wind", {}), base=13.0), name="v"),
     ]
-    assert bench["hidden_scores"].strengths(rows) == pytest.approx({"c1": 0.9, "c2": 1.1, "w": 1.2, "v": 1.3})
+    assert bench["hidden_scores"].strengths(rows) == pytest.approx({"c1": 1.0, "c2": 1.0, "w": 1.2, "v": 1.3})
     metric = "one effect: right name first"
     assert (cell(bench, rows, metric, "1.1 to 1.3")["count"], cell(bench, rows, metric, ">= 1.3")["count"]) == (0, 1)
+
+
+def test_strength_is_measured_on_the_same_motions_where_that_is_known(bench: dict[str, ModuleType]) -> None:
+    rows = [
+        judge(bench, (), answer("none", base=20.0), name="c"),
+        judge(bench, [("wind", 4.0)], answer("named", ("wind", {}), base=12.0), name="w", paired={"error_mm": 8.0}),
+    ]
+    assert bench["hidden_scores"].strengths(rows)["w"] == pytest.approx(1.5)
+    assert cell(bench, rows, "one effect: right name first", ">= 1.3")["count"] == 1
 
 
 def test_share_of_the_avoidable_error(bench: dict[str, ModuleType]) -> None:
