@@ -109,7 +109,6 @@ class Judgement:
     covered: bool | None  # its 90 % interval holds the truth
     base: float  # [mm] held out
     extended: float
-    floor: float | None
     oracle: float | None
     base_ood: float | None
     extended_ood: float | None
@@ -170,7 +169,7 @@ def judged(
         families=tuple(c["family"] for c in causes),
         group=tuple(dict.fromkeys((named[0], *causes[0].get("group", ())))) if named else (),
         confidence=_confidence(answer, causes), on_truth=_on_truth(answer, effects), parameter_error=error,
-        covered=covered, base=mm["base"], extended=mm["extended"], floor=mm.get("floor"),
+        covered=covered, base=mm["base"], extended=mm["extended"],
         oracle=None if oracle is None else oracle["error_mm"],
         base_ood=ood.get("base"), extended_ood=ood.get("extended"),
         oracle_ood=None if oracle is None else oracle["error_mm_ood"], seconds=answer["seconds"],

@@ -137,7 +137,7 @@ def name(suspect: Sequence[Normal], reference: Sequence[Normal]) -> tuple[str, f
     tests = len(kept)
     episodes = len(suspect) + len(reference)
     limit = float(student.ppf(1.0 - LEVEL / tests / 2.0, episodes - 1))
-    size = np.sqrt(np.maximum(sum(np.diag(n.matrix) for n in suspect), 1e-30))
+    size = np.sqrt(np.maximum(np.diag(_together(suspect)[0]), 1e-30))
     while kept:
         whole = _changes(suspect, reference, kept)
         left = [_changes([*suspect[:n], *suspect[n + 1 :]], reference, kept) for n in range(len(suspect))]
@@ -155,10 +155,15 @@ def name(suspect: Sequence[Normal], reference: Sequence[Normal]) -> tuple[str, f
 
 def _changes(suspect: Sequence[Normal], reference: Sequence[Normal], kept: Sequence[int]) -> Array:
     """(len(kept),) changes of coefficients, suspect minus reference."""
-    gs, bs = sum(n.matrix for n in suspect), sum(n.right for n in suspect)
-    g, b = gs + sum(n.matrix for n in reference), bs + sum(n.right for n in reference)
+    gs, bs = _together(suspect)
+    gr, br = _together(reference)
+    g, b = gs + gr, bs + br
     matrix = np.block([[g, gs[:, kept]], [gs[kept], gs[np.ix_(kept, kept)]]])
     right = np.concatenate([b, bs[list(kept)]])
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
     solved = np.linalg.lstsq(matrix * scale * scale[:, None], right * scale, rcond=1e-10)[0]
     return np.asarray((solved * scale)[len(b) :])
+
+
+def _together(episodes: Sequence[Normal]) -> tuple[Array, Array]:
+    return np.sum([n.matrix for n in episodes], axis=0), np.sum([n.right for n in episodes], axis=0)

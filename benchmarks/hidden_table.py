@@ -126,8 +126,8 @@ def _closed_ood(r: Judgement) -> float | None:
     return closed(r.base_ood, r.extended_ood, r.oracle_ood) if r.hidden else None
 
 
-def _closed_to_floor(r: Judgement) -> float | None:
-    return closed(r.base, r.extended, r.floor) if r.hidden else None
+def _closed_to_paired(r: Judgement) -> float | None:
+    return closed(r.base, r.extended, r.paired)
 
 
 def _size(r: Judgement) -> float | None:
@@ -164,7 +164,7 @@ METRICS: tuple[Metric, ...] = (
     ("avoidable error closed, median", ">= 85 %", number(_closed, 0.5, "%")),
     ("avoidable error closed, 10th percentile", ">= 50 %", number(_closed, 0.1, "%")),
     ("avoidable error closed out of distribution, median", ">= 75 %", number(_closed_ood, 0.5, "%")),
-    ("excess over the reference's error closed, median", "", number(_closed_to_floor, 0.5, "%")),
+    ("error that the effect adds closed, median", "", number(_closed_to_paired, 0.5, "%")),
     ("calibration error (10 bins)", "<= 0.07",
      plain(lambda rows: calibration_error([r.confidence for r in rows], [r.right for r in rows]))),
     ("Brier score of what was answered", "",

@@ -183,6 +183,8 @@ def test_share_of_the_avoidable_error(bench: dict[str, ModuleType]) -> None:
     oracle = {"error_mm": 6.0, "error_mm_ood": 19.5}
     row = judge(bench, [("wind", 4.0)], answer("named", ("wind", {}), base=10.0, extended=7.0), oracle=oracle)
     assert cell(bench, [row], "avoidable error closed, median")["value"] == pytest.approx(0.75)  # 3 of 4 mm
+    strong = judge(bench, [("swirl", 1.0)], answer("unknown", base=10.0, extended=9.0), paired={"error_mm": 5.0})
+    assert cell(bench, [strong], "error that the effect adds closed, median")["value"] == pytest.approx(0.2)  # 1 of 5
     # Out of distribution 0.5 of 20 mm is avoidable: less than 5 %, nothing to close a share of.
     assert cell(bench, [row], "avoidable error closed out of distribution, median") is None
 
