@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from pred_core.frames import (
     quaternion_conjugate,
@@ -28,6 +29,7 @@ SHORTEST, LONGEST = 0.6, 6.0  # [s] of a motion; LONGEST is how long each is wat
 REST = 0.5  # [s] at least of the watching after the motion has ended
 FARTHEST = 0.25  # [m] from the start
 TURN = 0.8  # [rad] from the start
+ROTATED = 2  # grippers; more are points of rigid ends, which cannot turn by themselves
 LEAST = 0.01  # [m], [rad] of a motion that is worth trying
 FINE = 400  # samples of a path in which its peaks are looked for
 
@@ -106,22 +108,47 @@ def library(
     for sign, name, axis in ((1, "+x", x), (-1, "-x", x), (1, "+y", y), (-1, "-y", y)):
         way = sign * axis
         rows.append((f"{'drag' if table else 'carry'} along {name}, slow", [(_move(room(way) * way), SLOW)]))
-    rows.append(("U-bend, slowly back over the object", [(_move(room(over) * over), SLOW)]))
+    if len(p) == 1:
+        rows.append(("U-bend, slowly back over the object", [(_move(room(over) * over), SLOW)]))
     way = z if room(z) >= room(-z) else -z
     rows.append(("lift and lower, slow", [(_there_and_back(room(way) * way), SLOW)]))
     ring = 0.5 * min(room(x), room(-x), room(y), room(-y))
     rows.append(("the same ring slow and fast", [(_ring(ring), SLOW), (_ring(ring), FAST)]))
-    rows.append(("hang still at three yaws", [(_turns(angle * z), FAST)]))
-    rows.append(("pure roll", [(_there_and_back(np.zeros(3), angle * grip_axis), FAST)]))
+    if len(p) <= ROTATED:
+        rows.append(("hang still at three yaws", [(_turns(angle * z), FAST)]))
+        rows.append(("pure roll", [(_there_and_back(np.zeros(3), angle * grip_axis), FAST)]))
     where = "on the table" if table else "in the air"
     made = [_motion(f"{name}, {where}", home, legs, grip, limits, period) for name, legs in rows]
+    if len(p) > 1:
+        made.append(_gathered(f"U-bend, the ends slowly together, {where}", home, grip, limits, period))
     return [m for m in made if m is not None]
 
 
+def _gathered(name: str, home: int, grip: Grip, limits: Limits, period: float) -> Motion | None:
+    """The grippers of the far end go towards the first one, as far as their boxes and half of the way allow."""
+    p = grip.position.double().numpy()
+    away = np.linalg.norm(p - p[0], axis=1)
+    end = int(away.argmax())
+    moves = np.linalg.norm(p - p[end], axis=1) < away
+    way = p[0] - p[end]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(way > 1e-9, (limits.high - p) / way, np.where(way < -1e-9, (limits.low - p) / way, np.inf))
+    least = float(np.clip(share[moves].min(initial=0.5), 0.0, 0.5))
+    return _motion(name, home, [(_move(least * way), SLOW)], grip, limits, period, moves)
+
+
 def _motion(
-    name: str, home: int, legs: list[tuple[Path, float]], grip: Grip, limits: Limits, period: float
+    name: str,
+    home: int,
+    legs: list[tuple[Path, float]],
+    grip: Grip,
+    limits: Limits,
+    period: float,
+    moves: NDArray[np.bool_] | None = None,
 ) -> Motion | None:
-    """The legs one after the other, then at rest until LONGEST; None: too small to be worth it."""
+    """The legs one after the other, then at rest until LONGEST; None: too small to be worth it. moves (G,): which
+    grippers; None: all.
+    """
     frames = round(LONGEST / period)
     shift, turn = np.zeros((frames, 3)), np.zeros((frames, 3))
     times, begin = period * np.arange(1, frames + 1), 0.0
@@ -137,7 +164,8 @@ def _motion(
         begin += seconds
     q = quaternion_from_rotation_vector(torch.as_tensor(turn))[:, None]
     rotation = quaternion_multiply(q, grip.rotation.double()[None])
-    return Motion(name, home, grip.position.double().numpy()[None] + shift[:, None], rotation.numpy())
+    who = np.ones(len(grip.position)) if moves is None else moves.astype(float)
+    return Motion(name, home, grip.position.double().numpy()[None] + who[:, None] * shift[:, None], rotation.numpy())
 
 
 def _paced(path: Path, share: float, limits: Limits, longest: float) -> tuple[float, float]:

@@ -61,6 +61,7 @@ def by_episode(parts: Sequence[Errors]) -> Figure:
             axes.axvline(part.floor, color=COLORS["reference"], linestyle="--", linewidth=1.2, label="reference (mean)")
         names = [part.base.names[k] for k in order]
         axes.set_yticks(y, names if len(names) <= MOST_LABELS else [""] * len(names), fontsize=8)
+        axes.set_ylim(-0.6, len(names) - 0.4)
         axes.set_title(part.split, loc="left", fontsize=11, fontweight="bold", color=INK)
         tidy(axes, "mean error over the whole episode [mm]", "")
         axes.grid(False, axis="y")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from pred_core.diagnose import pictures
 from pred_core.diagnose.chosen import chosen_of
 from pred_core.diagnose.evidence import Judged
@@ -13,6 +15,7 @@ from pred_core.diagnose.result import Diagnosis, Errors
 from pred_core.diagnose.rounds import Round
 from pred_core.diagnose.said import NAMES
 from pred_core.effects import find_effect
+from pred_core.evaluate.bootstrap import bootstrap_interval
 from pred_core.report import Page, number
 
 Network = Mapping[str, Mapping[str, float]]  # split -> {"base", "base + network", "extended", "extended + network"} mm
@@ -148,12 +151,23 @@ def add_budget(page: Page, d: Diagnosis) -> None:
     rows, total = budget_rows(d), d.errors.base.mean
     what = f"Where the {total:.1f} mm of the base come from ({d.errors.split} episodes)."
     page.figure(pictures.budget_bar(rows), what)
-    table = [(name, f"{mm:.2f}", f"{100 * mm / total:.0f} %" if total > 0 else "–") for name, mm, _ in rows]
-    table = [row for row, (_, mm, _) in zip(table, rows, strict=True) if mm != 0.0]
-    page.table(("part", "mm", "share"), [*table, ("sum = base", f"{sum(v for _, v, _ in rows):.2f}", "100 %")],
-               [*[""] * len(table), "strong"])  # fmt: skip
+    table = [(name, f"{mm:.2f}", f"{100 * mm / total:.0f} %" if total > 0 else "–") for name, mm, _ in rows if mm]
+    table.append(("sum = base", f"{sum(v for _, v, _ in rows):.2f}", "100 %"))
+    page.table(("part", "mm", "share"), table, [*[""] * (len(table) - 1), "strong"])
+    page.text(_bands(d), note=True)
     if d.errors.floor is None:
         page.text("Without a reference there is no floor: noise and chaos are part of what is unexplained.", note=True)
+
+
+def _bands(d: Diagnosis) -> str:
+    """95 % over episodes of what was taken away and of what is left."""
+    spans = []
+    for values in (d.errors.base.values - d.errors.extended.values, d.errors.extended.values):
+        if len(values) < 2:
+            return "One episode: no interval."
+        spans.append(bootstrap_interval(values, np.random.default_rng(d.seed)))
+    (a, b), (c, e) = spans
+    return f"95 % over episodes: taken away {a:.2f} to {b:.2f} mm, left {c:.2f} to {e:.2f} mm."
 
 
 def add_gate(page: Page, d: Diagnosis) -> None:
@@ -184,10 +198,14 @@ def _measured(c: GateCause) -> str:
         spans = c.interval.get(name, ())
         for k, value in enumerate(values):
             label = "" if len(c.parameters) == len(values) == 1 else f"{name} " if len(values) == 1 else f"{'xyz'[k]} "
-            low, high = (factor * v for v in spans[k]) if k < len(spans) else (0.0, 0.0)
-            span = f" [{low:.2f}, {high:.2f}]" if k < len(spans) else ""
-            parts.append(f"{label}{factor * value:.2f}{span}")
+            span = f" [{_short(factor * spans[k][0])}, {_short(factor * spans[k][1])}]" if k < len(spans) else ""
+            parts.append(f"{label}{_short(factor * value)}{span}")
     return f"{', '.join(parts)} {unit}" if parts else "–"
+
+
+def _short(value: float) -> str:
+    """Two digits after the point, no minus before zero."""
+    return f"{round(value, 2) + 0.0:.2f}"
 
 
 def add_open_questions(page: Page, d: Diagnosis) -> None:
