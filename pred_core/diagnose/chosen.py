@@ -10,8 +10,11 @@ from pred_core.diagnose.rounds import Round
 
 
 def chosen_of(rounds: Sequence[Round], causes: Sequence[Cause]) -> list[Judged | None]:
-    """For each round the candidate that was named in it. `causes`: of the answer, in the order they were named."""
-    left = [c.id for c in causes if not c.measured]
+    """For each round the candidate that was named in it. `causes`: of the answer, in the order they were named; those
+    that no round tried (the gate's, another structure) are left out.
+    """
+    tried = {i for seen in rounds for j, _, _ in seen.judged for i in j.trial.ids}
+    left = [c.id for c in causes if not c.measured and c.id in tried]
     found: list[Judged | None] = []
     for seen in rounds:
         fits = [j for j, _, why in seen.judged if not why and list(j.trial.ids) == left[: len(j.trial.ids)]]

@@ -25,6 +25,7 @@ from pred_core.types import Array, Episode, Physics
 BASE = ("stiffness", "ground_friction", "bending_stiffness")  # refined; axial damping does not show
 ROOM = 1.15  # times the substeps of the given twin that the refined one may need
 WORST = 0.25  # [m] mean error of a twin that is not this object's
+OWN_MISFIT = 0.02  # of the variance a base leaves that weights allow for without a reference
 POLISH = 8  # steps of the base's refinement
 
 
@@ -55,14 +56,14 @@ def commission(
     judged_on = known or sample
     use = np.array([s == "train" for s in judged_on.splits]) if known is None else None
     _check(Roller(twin, judged_on), judged_on, twin)
-    twin = _stored(twin, journal.once("base", lambda: _plain(_polish(twin, judged_on, use, config, tell))))
+    twin = with_stored(twin, journal.once("base", lambda: values_of(_polish(twin, judged_on, use, config, tell))))
     roller = Roller(twin, judged_on)
     as_it_is = Candidate(twin.physics, twin.extensions)
     plain = weigh(roller, as_it_is, config.stride, None, config.seed)
     errors = roller.errors([as_it_is], config.stride)[0]
     misfit = misfit_of(errors, seen_of(roller, config.stride), plain)
-    if known is None:  # the suspect's own misfit holds what is looked for: only a part of it is taken as the model's
-        misfit = 0.25 * misfit
+    if known is None:  # the suspect's own misfit holds what is looked for: little of it is taken as the model's
+        misfit = OWN_MISFIT * misfit
     own = Roller(twin, sample)
     target = Target(own, weigh(own, as_it_is, config.stride, misfit, config.seed), config.stride)
     other = None
@@ -83,7 +84,7 @@ def _kept_evidence(twin: Twin, candidate: Candidate) -> tuple:  # type: ignore[t
     return tuple(dataclasses.replace(e, evidence=known.get(e.id, {})) for e in candidate.extensions)
 
 
-def _plain(twin: Twin) -> dict[str, Any]:
+def values_of(twin: Twin) -> dict[str, Any]:
     """The values of a base that a refinement may change."""
     return {
         "physics": dataclasses.asdict(twin.physics),
@@ -91,7 +92,8 @@ def _plain(twin: Twin) -> dict[str, Any]:
     }
 
 
-def _stored(twin: Twin, values: dict[str, Any]) -> Twin:
+def with_stored(twin: Twin, values: dict[str, Any]) -> Twin:
+    """The twin at stored values."""
     extensions = tuple(
         dataclasses.replace(e, parameters={k: tuple(v) for k, v in found.items()})
         for e, found in zip(twin.extensions, values["extensions"], strict=True)
@@ -117,6 +119,16 @@ def _polish(twin: Twin, sample: Sample, use: Array | None, config: DiagnoseConfi
         if result.loss[chosen].mean() > 0.97 * before[chosen].mean():
             break
     return twin
+
+
+def refined(twin: Twin, target: Target, tell: Tell | None, steps: int = 8) -> Twin:
+    """The base refined on a target whose weights stay."""
+    own = Target(Roller(twin, target.roller.sample), target.weights, target.stride)
+    trial = make_trial(twin, (), base_fields(twin))
+    result = fit(own, trial.space, trial.space.start(), steps)
+    if tell is not None:
+        tell(f"base: loss {result.loss.mean():.3f}")
+    return with_values(twin, trial.space.candidate(result.z))
 
 
 def _check(roller: Roller, sample: Sample, twin: Twin) -> None:

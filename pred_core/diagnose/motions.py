@@ -24,6 +24,7 @@ from pred_core.types import Array, Episode, Grip
 
 LAG = 2  # frames to either side of a velocity
 USUAL = 0.99  # quantile of what was shown that counts as its largest
+MOST = (1.0, 10.0, 3.0)  # [m/s], [m/s^2], [rad/s] whatever was shown: a hand may be faster than an arm should be
 FAST, SLOW = 0.95, 0.3  # shares of the speed limit
 SHORTEST, LONGEST = 0.6, 6.0  # [s] of a motion; LONGEST is how long each is watched
 REST = 0.5  # [s] at least of the watching after the motion has ended
@@ -59,7 +60,7 @@ class Motion:
 
 
 def limits_of(episodes: Sequence[Episode]) -> Limits:
-    """Box, speeds and turns over all frames of these episodes."""
+    """Box, speeds and turns over all frames of these episodes, speeds and accelerations up to MOST."""
     places, speeds, accelerations, rates, turns = [], [0.0], [0.0], [0.0], [0.0]
     for e in episodes:
         p, q = e.grips.position.double(), e.grips.rotation.double()
@@ -78,7 +79,8 @@ def limits_of(episodes: Sequence[Episode]) -> Limits:
         rates.append(float(torch.quantile(rate.norm(dim=-1) / seconds, USUAL)))
         accelerations.append(float(torch.quantile(between.norm(dim=-1), USUAL)))
     every = np.concatenate(places)
-    return Limits(every.min(axis=0), every.max(axis=0), max(speeds), max(accelerations), max(rates), max(turns))
+    speed, acceleration, rate = (min(max(v), m) for v, m in zip((speeds, accelerations, rates), MOST, strict=True))
+    return Limits(every.min(axis=0), every.max(axis=0), speed, acceleration, rate, max(turns))
 
 
 def library(

@@ -42,7 +42,7 @@ def propose(answer: Diagnosis, episodes: Sequence[Episode], seed: int = 0) -> di
     mine = [e for e in episodes if e.split != "ood"]
     if pair is None or not mine or not mine[0].grips.position.shape[1]:
         return None
-    return choose(answer.base_twin, pair, mine, max(answer.gate.sigma, 1e-5), seed)
+    return choose(answer.twin, pair, mine, max(answer.gate.sigma, 1e-5), seed)
 
 
 def rivals_of(answer: Diagnosis) -> tuple[Rival, Rival] | None:

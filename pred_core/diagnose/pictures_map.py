@@ -100,8 +100,7 @@ def _arrows(axes: Axes, one: Above, usual: float, side: float) -> None:
         drawn = one.pull / length * np.minimum(length * scale, 2.0 * side)
     axes.quiver(xs, ys, drawn[..., 0], drawn[..., 1], angles="xy", scale_units="xy", scale=1.0, pivot="mid", color=INK,
                 width=0.005, alpha=0.85)  # fmt: skip
-    axes.text(0.99, 0.01, f"an arrow of one cell: {usual / 1.3:.1f} mm", transform=axes.transAxes, ha="right",
-              va="bottom", fontsize=8, color=GREY)  # fmt: skip
+    axes.set_title(f"an arrow of one cell: {usual / 1.3:.1f} mm", loc="right", fontsize=8, color=GREY)
 
 
 def direction(replays: Sequence[Replay], arc: Array) -> Figure:

@@ -14,11 +14,12 @@ from pred_core.diagnose.gate_result import GateCause
 from pred_core.diagnose.result import Diagnosis, Errors
 from pred_core.diagnose.rounds import Round
 from pred_core.diagnose.said import NAMES
-from pred_core.effects import find_effect
+from pred_core.effects import LIBRARY
 from pred_core.evaluate.bootstrap import bootstrap_interval
 from pred_core.report import Page, number
 
 Network = Mapping[str, Mapping[str, float]]  # split -> {"base", "base + network", "extended", "extended + network"} mm
+MOST_PARAMETERS = 6  # of a cause in the summary; a profile has many
 CELLS = ("base", "base + network", "extended", "extended + network")
 
 
@@ -31,13 +32,16 @@ def summary(page: Page, d: Diagnosis) -> None:
     """What was found and what it is worth, in one table each."""
     rows = []
     for c in d.causes:
-        for n, (name, v) in enumerate(c.parameters.items()):
+        for n, (name, v) in enumerate(list(c.parameters.items())[:MOST_PARAMETERS]):
             edge = " (at its bound)" if v.at_bound else ""
             kind = "sensor" if c.measured else "physics"
             first = (words(c.id), f"{c.probability:.2f}", kind) if n == 0 else ("", "", "")
             unit = "" if v.unit == "1" else f" {v.unit}"
             span = f"{number(v.low)} to {number(v.high)}"
             rows.append((*first, name, f"{number(v.value)}{unit}{edge}", span))
+        more = len(c.parameters) - MOST_PARAMETERS
+        if more > 0:
+            rows.append(("", "", "", f"and {more} more", "", ""))
     if rows:
         page.table(("cause", "probability", "kind", "parameter", "value", "90 % interval"), rows)
     page.table(
@@ -215,7 +219,7 @@ def add_open_questions(page: Page, d: Diagnosis) -> None:
         if c.group:
             page.text(f"These data do not tell {words(c.id)} from {', '.join(map(words, c.group))}.")
         elif not c.measured:
-            usual = [words(i) for i in find_effect(c.id).confounded_with]
+            usual = [words(i) for i in LIBRARY[c.id].confounded_with] if c.id in LIBRARY else []
             if usual:
                 page.text(f"Often confused with {words(c.id)}, and told apart here: {', '.join(usual)}.", note=True)
     page.table(("no data of this kind tells",), [(line,) for line in d.not_identifiable])

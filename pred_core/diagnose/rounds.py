@@ -25,6 +25,8 @@ LEFT = 0.25  # of the floor: an excess that is called unknown if nothing explain
 SURE = 0.01  # p value of a lack of fit
 FEW, FINALISTS = 2, 5  # candidates that are fitted to the end: at least, and at most
 BEHIND = 0.35  # share of the leader's gain below which the others are not
+UNEXPLAINED = 3.0  # times the loss of noise: without a reference, what is left is then worth saying
+NOISE = 0.4  # loss of residuals that are noise: the mean of rho(u) for u ~ N(0, 1) is 0.36
 PAIRED = 5  # candidates whose pairs are tried
 STANDING = 0.05  # of the floor: a gain below is not worth a name, whatever its significance
 
@@ -68,7 +70,9 @@ def candidates(bench: Bench, named: Sequence[str]) -> list[Effects]:
     cold = bench.reference is None
     rows: list[Effects] = []
     for effect in LIBRARY.values():
-        if set(effect.hooks) == {"observe"} or effect.id in NOT_A_NAME or effect.id in GATE_ONLY or effect.id in named:
+        if set(effect.hooks) == {"observe"} or effect.id in GATE_ONLY or effect.id in named:
+            continue
+        if effect.id in NOT_A_NAME and not (cold and effect.id == "rest_curvature"):
             continue
         if "contact" in effect.hooks and twin.scene.ground is None:
             continue
@@ -133,6 +137,8 @@ def _something_left(progress: Progress, base: Array, floor: float) -> bool:
     """Whether what is left after a name is worth another look."""
     first = progress.rounds[0]
     whole = float(first.base.mean()) - first.floor
+    if progress.bench.reference is None:
+        return float(base.mean()) > NOISE
     return float(base.mean()) - floor > max(progress.bench.config.gate * whole, STANDING * floor)
 
 
@@ -140,6 +146,7 @@ def finish(progress: Progress) -> None:
     """Decide whether something is left that has no name."""
     bench = progress.bench
     if bench.reference is None:
+        progress.unknown = not progress.named and float(bench.standing().mean()) > UNEXPLAINED * NOISE
         return
     suspect, reference = bench.standing(), _reference_losses(bench)
     p = lack_of_fit(
@@ -216,7 +223,7 @@ def _why_not(j: Judged, p: float, excess: float, floor: float, progress: Progres
     config = progress.bench.config
     cold = progress.bench.reference is None
     first = progress.rounds[0] if progress.rounds else None
-    whole = excess if first is None else max(float(first.base.mean()) - first.floor, excess)
+    whole = excess if first is None or cold else max(float(first.base.mean()) - first.floor, excess)
     least = max((config.cold_gate if cold else config.gate) * whole, STANDING * floor)
     better, acting = j.improved
     if acting < 4:
@@ -244,6 +251,8 @@ def _pairs(
     """Two causes at once, where no single one explains enough: they can mask each other."""
     bench, config = progress.bench, progress.bench.config
     excess = float(base.mean()) - floor
+    if bench.reference is None:  # without a floor nobody knows how much is enough
+        return None
     if excess < LEFT * floor or number + 2 > config.causes:
         return None
     order = sorted(range(len(judged)), key=lambda n: -judged[n].mean)[:PAIRED]

@@ -17,6 +17,7 @@ from pred_core.diagnose.ranking import explains, ranking
 from pred_core.diagnose.result import Cause, Diagnosis, Errors, Value
 from pred_core.diagnose.rounds import Named, Progress, finish, one_round
 from pred_core.diagnose.said import not_identifiable, sentence
+from pred_core.diagnose.structure import FAMILY, ID, applies, question
 from pred_core.effects import find_effect
 from pred_core.errors import DatasetError
 from pred_core.twin import Extension, Twin
@@ -59,6 +60,8 @@ def diagnose(
     journal = journal or Journal(None, {})
     bench = commission(plain, [e for e in corrected if e.split != "ood"], known, config, tell, journal)
     progress = Progress(bench, journal)
+    if bench.reference is None and applies(bench.twin):
+        _change_structure(progress, tell)
     for number in range(config.causes):
         if not one_round(progress, tell, number):
             break
@@ -66,6 +69,20 @@ def diagnose(
         tell(f"named: {found.judged.trial.id}, closes {found.closed:.0%} of the excess")
     finish(progress)
     return _answer(progress, bench, gate, twin, episodes, corrected, known, config, begin, tell)
+
+
+def _change_structure(progress: Progress, tell: Tell) -> None:
+    """Name bending by angle, if a chain with it is better than the springs as they are."""
+    base = progress.bench.standing()
+    found = question(progress.bench, progress.journal, tell)
+    if found is None:
+        return
+    bench, judged, p = found
+    closed = judged.mean / float(base.mean())
+    if closed < progress.bench.config.cold_gate:
+        return
+    progress.named.append(Named(judged, p, (), closed, -1))
+    progress.bench = bench
 
 
 def _answer(
@@ -155,6 +172,11 @@ def _named(named: Sequence[Named]) -> list[Cause]:
     rows = []
     for n in named:
         j = n.judged
+        if j.trial.ids == (ID,):
+            name = j.trial.space.knobs[0].name
+            value = Value(j.values[name], j.trial.space.knobs[0].unit, *j.intervals[name])
+            rows.append(Cause(ID, FAMILY, explains(n.closed), {name: value}, False, n.closed, n.p_adjusted))
+            continue
         for id in j.trial.ids:
             effect = find_effect(id)
             values = {}

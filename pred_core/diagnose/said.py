@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from pred_core.diagnose.rounds import Progress
 
 NAMES = {
+    "bending_by_angle": "resistance to bending by angle, instead of springs that skip particles",
+    "rest_curvature": "a rest curvature that varies along the object",
     "drag_linear": "air drag", "drag_quadratic": "quadratic air drag", "gravity_offset": "a different gravity direction",
     "bending_damping": "damping in bending", "bending_hysteresis": "dry friction inside the cable", "wind": "wind",
     "attraction": "a force towards a place", "tether": "a thread to a fixed point", "obstacle": "an obstacle",

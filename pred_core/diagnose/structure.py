@@ -1,0 +1,133 @@
+"""The first question to a plain spring-mass line: does it resist bending by its angles, not by springs that skip?
+
+Springs between particles that are not neighbours resist bending only in the second order of the angle, and shorten
+the line's chords. It is a cause of another kind than the effects: the springs themselves change.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from pred_core.diagnose.commission import base_fields, refined, values_of, with_stored
+from pred_core.diagnose.evidence import Judged, family_wise
+from pred_core.diagnose.fit import Target, rho
+from pred_core.diagnose.journal import Journal
+from pred_core.diagnose.judge import Bench, Tell
+from pred_core.diagnose.roll import Roller
+from pred_core.diagnose.trial import Trial, make_trial
+from pred_core.diagnose.weigh import Weights
+from pred_core.identify.space import Candidate
+from pred_core.twin import Twin
+from pred_core.types import Array
+
+ID = "bending_by_angle"
+FAMILY = "bending"
+GRID = tuple(float(v) for v in np.logspace(-5, -1, 9))  # [N m^2] bending stiffnesses tried first
+STIFF = (1.0, 10.0, 100.0)  # axial stiffnesses tried first, over the present one
+
+
+def applies(twin: Twin) -> bool:
+    """A line whose bending is left to springs that skip particles, or to nothing."""
+    return twin.body.kind == "line" and twin.physics.bending_stiffness == 0.0 and len(twin.body.bends) > 0
+
+
+def chain(twin: Twin) -> Twin:
+    """The twin with springs between neighbours alone."""
+    body = twin.body
+    bends = np.asarray(body.bends)
+    path = [*bends[:, 0].tolist(), *bends[-1, 1:].tolist()]
+    neighbours = {tuple(sorted(p)) for p in zip(path[:-1], path[1:], strict=True)}
+    keep = np.array([tuple(sorted(s)) in neighbours for s in body.springs.tolist()])
+    slim = dataclasses.replace(
+        body,
+        springs=np.ascontiguousarray(body.springs[keep]),
+        rest_length=body.rest_length[keep],
+        stiffness_scale=body.stiffness_scale[keep],
+        damping_scale=body.damping_scale[keep],
+    )
+    longest = 1.001 * float(slim.rest_length.max())
+    physics = dataclasses.replace(twin.physics, max_springs=2, connection_threshold=longest, bending_stiffness=1e-3)
+    return twin.replace(body=slim, physics=physics)
+
+
+def question(bench: Bench, journal: Journal, tell: Tell) -> tuple[Bench, Judged, float] | None:
+    """The bench with a chain instead, what that gains on held-out recordings, and its p value; None: no gain."""
+    before, slim = bench.twin, chain(bench.twin)
+    fitted, target = bench.fitted, bench.target
+
+    def fit_chain() -> dict[str, object]:
+        best = _first(slim, fitted)
+        twin = refined(best, fitted, tell)
+        rows = []
+        groups = fitted.roller.sample.groups
+        for group in sorted(set(groups.tolist())):
+            keep = np.flatnonzero(groups != group).tolist()
+            own = refined(twin, fitted.part(keep), None, steps=1) if keep else twin
+            rows.append([int(group), values_of(own)])
+        return {"twin": values_of(twin), "without": rows}
+
+    stored = journal.once("structure", fit_chain)
+    twin = with_stored(slim, stored["twin"])
+    base = _losses(before, target)
+    extended = _losses(twin, target)
+    train = bench.train
+    for group, values in stored["without"]:
+        mine = train & (target.roller.sample.groups == group)
+        if mine.any():
+            extended[mine] = _losses(with_stored(slim, values), target)[mine]
+    trial = _trial(twin)
+    knobs = trial.space.knobs
+    spread = [with_stored(slim, v).physics.bending_stiffness for _, v in stored["without"]]
+    width = 1.645 * float(np.std(spread)) * max(len(spread) - 1, 1) ** 0.5
+    value = twin.physics.bending_stiffness
+    judged = Judged(
+        trial=trial,
+        values={k.name: value for k in knobs},
+        null={k.name: 0.0 for k in knobs},
+        intervals={k.name: (max(value - width, 0.0), value + width) for k in knobs},
+        gain=base - extended,
+        acts=np.ones(len(base), dtype=bool),
+        extended=extended,
+        z=trial.space.start(),
+    )
+    p = float(family_wise([judged], bench.config.seed)[0])
+    tell(f"bending by angle: loss {base.mean():.3f} -> {extended.mean():.3f}")
+    if p > bench.config.level or judged.mean <= 0.0:
+        return None
+    target, fitted = _on(twin, target), _on(twin, fitted)
+    changed = dataclasses.replace(
+        bench, twin=twin, reference_twin=twin, target=target, fitted=fitted, physics=base_fields(twin)
+    )
+    return changed, judged, p
+
+
+def _first(slim: Twin, fitted: Target) -> Twin:
+    """The best of a coarse grid: bending stiffness spans many orders of magnitude."""
+    twins = [
+        slim.replace(
+            physics=dataclasses.replace(slim.physics, bending_stiffness=b, stiffness=s * slim.physics.stiffness)
+        )
+        for b in GRID
+        for s in STIFF
+    ]
+    usual = max(Roller(slim, fitted.roller.sample).usual(), float(slim.meta.substeps or 1))
+    possible = [t for t in twins if Roller(t, fitted.roller.sample).usual() <= 3.0 * usual] or twins[:1]
+    return min(possible, key=lambda t: float(_losses(t, fitted).mean()))
+
+
+def _losses(twin: Twin, target: Target) -> Array:
+    """(E,) of a twin with the target's weights."""
+    u = Roller(twin, target.roller.sample).errors([Candidate(twin.physics, twin.extensions)], target.stride)
+    return target.per_episode(rho(u * target.weights[..., None]))[0]
+
+
+def _on(twin: Twin, target: Target) -> Target:
+    weights: Weights = target.weights
+    return Target(Roller(twin, target.roller.sample), weights, target.stride)
+
+
+def _trial(twin: Twin) -> Trial:
+    space = make_trial(twin, (), ("bending_stiffness",)).space
+    return Trial((ID,), FAMILY, space, (0,))
