@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from pred_core.types import Array
 
 KEPT_STARTS = 4
 QUICK, TRIED = 2, 2  # steps, and starts, of a candidate before it is told whether it goes on
-NULL_STEPS = 4  # of a candidate's refinement on the reference
 Tell = Callable[[str], None]
 Effects = tuple[type[Effect], ...]
 
@@ -37,7 +36,6 @@ class Bench:
     reference: Target | None
     config: DiagnoseConfig
     physics: tuple[str, ...] = ()  # base parameters that every candidate refits: without a reference, all of them
-    nulls: dict[str, dict[str, float]] = field(default_factory=dict)  # candidate -> what the reference says of it
 
     @property
     def train(self) -> NDArray[np.bool_]:
@@ -94,25 +92,37 @@ def quick(bench: Bench, screened: Screened, journal: Journal, key: str) -> tuple
     return np.array(z), float(loss)
 
 
-def null_of(bench: Bench, screened: Screened) -> Array:
+def null_of(bench: Bench, screened: Screened, found: Array) -> Array:
     """Coordinates of "no change": what the reference says of the candidate's parameters, else off.
 
-    What the engine and the object lack in common would otherwise count as a change. A localized cause, which the
-    reference cannot have in the same place, is off.
+    What the engine and the object lack in common would otherwise count as a change. The reference is fitted with the
+    same budget, from off and from where the suspect set led (`found`): a fit that ended early would look like a change.
     """
     trial = screened.trial
-    if bench.reference is None or any(scanned(e) for e in screened.effects):
+    if bench.reference is None:
         return screened.null
-    if trial.id not in bench.nulls:
-        other = make_trial(bench.reference_twin, screened.effects, ())
-        result = fit(bench.reference, other.space, other.space.start(), NULL_STEPS)
-        bench.nulls[trial.id] = other.space.values(result.z)
-    values = bench.nulls[trial.id]
+    other = make_trial(bench.reference_twin, screened.effects, ())
+    begins = [_like(trial, other, found)]
+    if not any(scanned(e) for e in screened.effects):
+        begins.append(other.space.start())
+    ends = [fit(bench.reference, other.space, z, bench.config.iterations) for z in begins]
+    best = min(ends, key=lambda f: float(f.loss.mean()))
+    values = other.space.values(best.z)
     null = screened.null.copy()
     for n, knob in enumerate(trial.space.knobs):
         if knob.name in values:
             null[n] = knob.coordinate(values[knob.name])
     return null
+
+
+def _like(source: Trial, target: Trial, z: Array) -> Array:
+    """The same values in another trial's space."""
+    values = source.space.values(z)
+    result = target.space.start()
+    for n, knob in enumerate(target.space.knobs):
+        if knob.name in values:
+            result[n] = knob.coordinate(values[knob.name])
+    return result
 
 
 def judge(bench: Bench, screened: Screened, journal: Journal, key: str) -> Judged:
@@ -124,7 +134,7 @@ def judge(bench: Bench, screened: Screened, journal: Journal, key: str) -> Judge
         trial=trial,
         values=space.values(z),
         null=space.values(np.array(values["null"])),
-        intervals=_intervals(trial, z, np.array(values["left_out"])),
+        intervals=_intervals(trial, z, np.array(values["null"]), np.array(values["left_out"])),
         gain=np.array(values["gain"]),
         acts=np.array(values["moved"]) > ACTS,
         extended=np.array(values["extended"]),
@@ -137,7 +147,7 @@ def _judge(bench: Bench, screened: Screened) -> dict[str, object]:
     trial, space, target = screened.trial, screened.trial.space, bench.target
     train = bench.train
     result = fit(bench.fitted, trial.space, screened.starts[0].z, bench.config.iterations)
-    null = null_of(bench, screened)
+    null = null_of(bench, screened, result.z)
     sample = target.roller.sample
     left_out = without_groups(result, space, sample.groups[train])
     u = target.residuals(space, [null, result.z, *left_out.values()])
@@ -157,18 +167,20 @@ def _judge(bench: Bench, screened: Screened) -> dict[str, object]:
     }
 
 
-def _intervals(trial: Trial, z: Array, left_out: Array) -> dict[str, tuple[float, float]]:
-    """90 % by the jackknife over recordings (Efron 1982), as values."""
+def _intervals(trial: Trial, z: Array, null: Array, left_out: Array) -> dict[str, tuple[float, float]]:
+    """90 %, as values: the jackknife over recordings (Efron 1982) and what simulations of one rope differ by."""
     groups = len(left_out)
     if groups < 2:
         return {k.name: (k.low, k.high) for k in trial.space.knobs}
     centre = left_out.mean(axis=0)
     error = np.sqrt((groups - 1) / groups * ((left_out - centre) ** 2).sum(axis=0))
-    width = JACKKNIFE.get(groups, 1.8) * error
+    width = np.hypot(JACKKNIFE.get(groups, 1.8) * error, 1.645 * MISMATCH * np.abs(z - null))
     return {
         k.name: (k.value(float(z[n] - width[n])), k.value(float(z[n] + width[n])))
         for n, k in enumerate(trial.space.knobs)
     }
 
 
+# Relative standard error of a parameter between two engines, beyond the scatter over recordings; from development cases.
+MISMATCH = 0.06
 JACKKNIFE = {2: 6.31, 3: 2.92, 4: 2.35, 5: 2.13, 6: 2.02, 7: 1.94, 8: 1.89}  # Student's t, 95 %, groups - 1

@@ -79,8 +79,8 @@ def limits_of(episodes: Sequence[Episode]) -> Limits:
         rates.append(float(torch.quantile(rate.norm(dim=-1) / seconds, USUAL)))
         accelerations.append(float(torch.quantile(between.norm(dim=-1), USUAL)))
     every = np.concatenate(places)
-    speed, acceleration, rate = (min(max(v), m) for v, m in zip((speeds, accelerations, rates), MOST, strict=True))
-    return Limits(every.min(axis=0), every.max(axis=0), speed, acceleration, rate, max(turns))
+    fast, sharp, turning = (min(max(v), m) for v, m in zip((speeds, accelerations, rates), MOST, strict=True))
+    return Limits(every.min(axis=0), every.max(axis=0), fast, sharp, turning, max(turns))
 
 
 def library(

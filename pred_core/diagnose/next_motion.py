@@ -30,6 +30,7 @@ WIDE = 1.0  # width of a 90 % interval over the value from which a single cause'
 NORMAL = 1.645  # standard deviations of half a 90 % interval
 STEP = 0.05  # least coordinate step of a slope
 SPACING = 0.05  # [s] between the points of the plan
+DIGITS = 7  # after the point, of its numbers
 
 
 def propose(answer: Diagnosis, episodes: Sequence[Episode], seed: int = 0) -> dict[str, Any] | None:
@@ -195,9 +196,10 @@ def trajectory(motion: Motion, start: Grip, period: float) -> dict[str, Any]:
         "joint_names": [f"gripper{g}" for g in range(position.shape[1])],
         "points": [
             {
-                "time_from_start": t,
+                "time_from_start": round(t, DIGITS),
                 "transforms": [
-                    {"translation": position[k, g].tolist(), "rotation": rotation[k, g].tolist()}
+                    {"translation": position[k, g].round(DIGITS).tolist(),
+                     "rotation": rotation[k, g].round(DIGITS).tolist()}
                     for g in range(position.shape[1])
                 ],
             }

@@ -71,6 +71,13 @@ def add_evidence(page: Page, d: Diagnosis) -> None:
         "of the base over what the reference leaves (without a reference: over nothing). Dots are episodes, bars 95 %.",
         note=True,
     )
+    tried = {i for seen in d.rounds for j, _, _ in seen.judged for i in j.trial.ids}
+    for c in d.causes:
+        if c.measured:
+            page.text(f"{words(c.id)}: measured without the simulation, see below; corrected before anything is tried.")
+        elif c.id not in tried:
+            share = f"it saves {c.closed:.0%} of the loss of the base (p {c.p_adjusted:.2g})"
+            page.text(f"{words(c.id)}: another structure of the model, asked before the candidates; {share}.")
     if not d.rounds:
         page.text("No candidate was tried.")
     chosen = chosen_of(d.rounds, d.causes)

@@ -164,7 +164,7 @@ def extend(bench: Bench, judged: Judged) -> Bench:
     changed = {e.id: e for e in space.candidate(null).extensions if e.id in judged.trial.ids}
     kept = tuple(changed.pop(e.id, e) for e in bench.reference_twin.extensions) + tuple(changed.values())
     reference = bench.reference_twin.replace(extensions=kept)
-    return dataclasses.replace(bench, twin=twin, reference_twin=reference, nulls={})
+    return dataclasses.replace(bench, twin=twin, reference_twin=reference)
 
 
 def _reference_losses(bench: Bench) -> Array:
