@@ -14,7 +14,9 @@ from pred_core.cli.checks import warn_of_another_object
 from pred_core.cli.settings import add_settings, given_settings, read_settings
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.journal import Journal
+from pred_core.diagnose.motion_file import write_motion
 from pred_core.diagnose.report import write_report
+from pred_core.diagnose.result import Diagnosis
 from pred_core.diagnose.run import diagnose
 from pred_core.evaluate.report import write_json
 from pred_core.twin import Twin
@@ -50,12 +52,22 @@ def run(args: argparse.Namespace) -> int:
     meta = dataclasses.replace(answer.twin.meta, created_by=command)
     answer.twin.replace(meta=meta).save(args.out / "twin")
     write_json(args.out / "diagnosis.json", {**answer.to_json(), "command": command})
+    _write_next_motion(args.out / "next_motion.yaml", answer)
     write_report(args.out / "report.html", answer, episodes, known, command)
     print(answer.sentence)
     for row in answer.ranking[:5]:
         print(f"  {row.probability:5.2f}  {row.id:24s} {row.rejected}")
     print(f"{args.out / 'report.html'}  {args.out / 'diagnosis.json'}  {args.out / 'twin'}  ({answer.seconds:.0f} s)")
     return 0
+
+
+def _write_next_motion(path: Path, answer: Diagnosis) -> None:
+    """The motion that would tell causes apart; the one of an earlier answer in the folder goes."""
+    if answer.next_motion is None:
+        path.unlink(missing_ok=True)
+    else:
+        write_motion(path, answer.next_motion)
+        print(f"to tell more, record: {answer.next_motion['name']} ({path})")
 
 
 def _header(dataset: Dataset, reference: Dataset | None, twin: Twin, config: DiagnoseConfig) -> dict[str, object]:

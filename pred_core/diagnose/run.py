@@ -13,6 +13,7 @@ from pred_core.diagnose.errors import episode_errors, gain_of
 from pred_core.diagnose.gate import GateCause, GateResult, measure
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Bench, Tell
+from pred_core.diagnose.next_motion import propose
 from pred_core.diagnose.ranking import explains, ranking
 from pred_core.diagnose.result import Cause, Diagnosis, Errors, Value
 from pred_core.diagnose.rounds import Named, Progress, finish, one_round
@@ -133,7 +134,8 @@ def _answer(
         seconds=time.monotonic() - begin,
         seed=config.seed,
     )
-    return dataclasses.replace(answer, sentence=sentence(answer))
+    answer = dataclasses.replace(answer, next_motion=propose(answer, corrected, config.seed))
+    return dataclasses.replace(answer, sentence=sentence(answer), seconds=time.monotonic() - begin)
 
 
 def _outcome(causes: Sequence[Cause], progress: Progress) -> str:

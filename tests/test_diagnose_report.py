@@ -1,0 +1,177 @@
+"""The report of a diagnosis: where its map puts an error, what its budget adds up to, what it always has."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from report_cases import HOME, answer, drag, recorded, rope, with_errors
+
+from pred_core.calibration import Calibration
+from pred_core.diagnose.chosen import chosen_of
+from pred_core.diagnose.map import FEATURES, Replay, conditional, edges_of, from_above, grid_of, replay
+from pred_core.diagnose.next_motion import propose
+from pred_core.diagnose.report import write_report
+from pred_core.diagnose.report_parts import budget_rows
+from pred_core.effects import find_effect
+from pred_core.twin import Twin
+from pred_core.types import Episode
+
+SPLITS = ("train",) * 5 + ("test",) * 3
+SECTIONS = (
+    "Where and when the error sits", "Evidence: what explains it, and what does not", "Before and after",
+    "Errors by episode", "Error budget", "Measured without the simulation", "What cannot be told apart",
+    "The motion that would tell it apart", "With and without a network", "How it was made",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def twin() -> Twin:
+    return rope()
+
+
+@pytest.fixture(scope="module")
+def dragged(twin: Twin) -> list[Episode]:
+    return recorded(twin, drag(), SPLITS)
+
+
+def by_hand(size: np.ndarray, feature: np.ndarray, seen: np.ndarray) -> Replay:
+    """A replay whose error has these sizes [mm] (E, K, N), along x, one window an episode."""
+    error = np.zeros((*size.shape, 3))
+    error[..., 0] = size * 1e-3
+    return Replay("base", error, seen, np.arange(len(size)), len(size), np.zeros_like(error), {"along": feature})
+
+
+def test_the_mean_in_a_bin_is_the_mean_of_its_samples_over_all_episodes() -> None:
+    """Particles at 0 and 1: 1 mm at the first, 4 and 8 mm at the second, of which one episode shows one frame only:
+    (3 * 4 + 1 * 8) / 4 = 5 mm over all samples. Episodes of 4 and of 8 mm bound every draw of episodes.
+    """
+    size = np.array([[[1.0, 4.0]] * 3, [[1.0, 8.0]] * 3])
+    seen = np.ones((2, 3, 2), dtype=bool)
+    seen[1, 1:, 1] = False
+    arc = np.broadcast_to(np.array([0.0, 1.0]), size.shape)
+    rows = by_hand(size, arc, seen)
+    curve = conditional(rows, "along", edges_of(rows, "along"), np.random.default_rng(0))
+    assert np.allclose(curve.mean, (1.0, 5.0))
+    assert curve.low[0] == curve.high[0] == pytest.approx(1.0)
+    assert curve.low[1] == pytest.approx(4.0) and curve.high[1] == pytest.approx(8.0)
+
+
+def test_a_bin_that_few_episodes_reach_is_not_drawn() -> None:
+    """Four episodes; the second particle is seen in two of them: fewer than the three a bin needs."""
+    size, arc = np.ones((4, 2, 2)), np.broadcast_to(np.array([0.0, 1.0]), (4, 2, 2))
+    seen = np.ones((4, 2, 2), dtype=bool)
+    seen[:2, :, 1] = False
+    rows = by_hand(size, arc, seen)
+    curve = conditional(rows, "along", edges_of(rows, "along"), np.random.default_rng(0))
+    assert curve.mean[0] == pytest.approx(1.0) and np.isnan(curve.mean[1])
+
+
+def test_drag_that_is_missing_shows_at_speed_at_the_free_end_and_late(twin: Twin, dragged: list[Episode]) -> None:
+    """What lacks drag is wrong where the object is fast, far from the gripper, and some time after a start; with the
+    drag in the twin only noise is left (0.3 mm an axis, and the start has it too): nowhere a fifth of the base's worst.
+    """
+    base = replay("base", twin, dragged, Calibration())
+    known = replay("extended", twin.replace(extensions=drag()), dragged, Calibration())
+    for key in ("speed", "along", "distance", "since"):
+        edges = edges_of(base, key)
+        mean = conditional(base, key, edges, np.random.default_rng(0)).mean
+        assert np.nanmean(mean[-2:]) > 2.0 * np.nanmean(mean[:2]), key
+        assert np.nanmax(conditional(known, key, edges, np.random.default_rng(0)).mean) < 0.2 * np.nanmax(mean)
+    assert set(base.features) == {f.key for f in FEATURES}
+
+
+def test_the_map_from_above_points_to_a_planted_place(twin: Twin) -> None:
+    """A force towards a place that the rope swings past: the arrows around it point towards it (mean cosine above 0.5),
+    and the error beside it is larger than far away.
+    """
+    centre = HOME + (0.09, 0.0, -0.4)
+    pulled = find_effect("attraction").extension(strength=(1.5,), center=tuple(centre.tolist()), range=(0.08,))
+    episodes = recorded(twin, (pulled,), ("train",) * 8, seed=40)
+    base = replay("base", twin, episodes, Calibration())
+    x, y = grid_of([base])
+    seen = from_above(base, x, y)
+    xs, ys = np.meshgrid((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2)
+    towards = np.stack((centre[0] - xs, centre[1] - ys), axis=-1)
+    far = np.linalg.norm(towards, axis=-1)
+    known = np.isfinite(seen.mean) & (far > x[1] - x[0])
+    near = known & (far < 0.10)
+    cosine = (seen.pull * towards).sum(-1) / np.linalg.norm(seen.pull, axis=-1) / far
+    assert near.sum() >= 5 and np.average(cosine[near], weights=np.linalg.norm(seen.pull, axis=-1)[near]) > 0.5
+    assert np.nanmean(seen.mean[near]) > 1.5 * np.nanmean(seen.mean[known & (far > 0.15)])
+
+
+@pytest.mark.parametrize(
+    ("base", "extended", "floor", "named"),
+    [
+        ((12.0, 14.0), (6.0, 8.0), 3.0, {"drag_linear": 4.0, "wind": 2.0}),
+        ((12.0, 14.0), (6.0, 8.0), None, {"drag_linear": 5.0}),  # one mm came from refitting the base
+        ((10.0, 10.0), (11.0, 11.0), 2.0, {"wind": -1.0}),  # it makes the held-out episodes worse
+        ((5.0, 5.0), (5.0, 5.0), 9.0, {}),  # better than the reference
+    ],
+)
+def test_the_budget_adds_up_to_the_error_of_the_base(
+    twin: Twin, dragged: list[Episode], base: tuple, extended: tuple, floor: float | None, named: dict
+) -> None:
+    d = answer(twin, dragged)
+    errors = with_errors(d, base, extended, floor)
+    least = min(floor or 0.0, errors.extended.mean)
+    budget = {"named": named, "learned": 0.0, "unexplained": errors.extended.mean - least, "floor": least}
+    rows = budget_rows(dataclasses.replace(d, errors=errors, budget=budget))
+    assert sum(mm for _, mm, _ in rows) == pytest.approx(np.mean(base), abs=1e-9)
+    assert {name: mm for name, mm, _ in rows}["unexplained"] == pytest.approx(budget["unexplained"])
+
+
+def test_a_cause_of_measurement_is_shown_beside_the_raw_tracks(
+    twin: Twin, dragged: list[Episode], tmp_path: Path
+) -> None:
+    """The extended twin is compared with tracks shifted by 2 cm as its calibration says; both are in the animation.
+    Without a calibration there is one track only.
+    """
+    for shift in (0.0, 0.02):
+        d = answer(twin, dragged)
+        moved = d.twin.replace(calibration=Calibration(translation=(shift, 0.0, 0.0)))
+        write_report(tmp_path / "report.html", dataclasses.replace(d, twin=moved), dragged, None, "pred diagnose")
+        assert ("measured, corrected" in (tmp_path / "report.html").read_text("utf-8")) == (shift > 0.0)
+
+
+def test_a_change_of_structure_is_told_though_no_round_tried_it(
+    twin: Twin, dragged: list[Episode], tmp_path: Path
+) -> None:
+    """It stands first among the causes; the candidate named after it is still found in its round."""
+    d = answer(twin, dragged)
+    first = dataclasses.replace(d.causes[0], id="bending_by_angle", family="bending", closed=0.6)
+    d = dataclasses.replace(d, causes=(first, *d.causes))
+    named = chosen_of(d.rounds, d.causes)
+    assert [None if j is None else j.trial.id for j in named] == ["drag_linear"]
+    write_report(tmp_path / "report.html", d, dragged, None, "pred diagnose")
+    text = (tmp_path / "report.html").read_text("utf-8")
+    assert "another structure of the model" in text and "it saves 60% of the loss" in text
+
+
+@pytest.mark.parametrize("outcome", ["none", "named", "group", "unknown"])
+def test_a_report_opens_with_its_sentence_and_has_every_section(
+    twin: Twin, dragged: list[Episode], tmp_path: Path, outcome: str
+) -> None:
+    """Whatever the outcome; with a reference where something is named. One file that loads nothing."""
+    d = answer(twin, dragged, outcome)
+    d = dataclasses.replace(d, next_motion=propose(d, dragged))
+    assert (d.next_motion is not None) == (outcome in ("named", "group"))
+    known = recorded(twin, (), ("train",) * 3, seed=90) if outcome == "named" else None
+    path = tmp_path / "report.html"
+    network = {"test": {"base": 12.0, "base + network": 7.0, "extended": 3.0, "extended + network": 2.5}}
+    write_report(path, d, dragged, known, "pred diagnose <data>", network if outcome == "group" else None)
+    text = path.read_text("utf-8")
+    assert text.index(d.sentence) < text.index("<h2>")
+    places = [text.index(f"<h2>{s}") for s in SECTIONS]
+    assert places == sorted(places)
+    assert "pred diagnose &lt;data&gt;" in text and "src=\"http" not in text
+    assert ("reference's episodes" in text.replace("&#x27;", "'")) == (known is not None)
+    assert ("<td>2.5</td>" in text) == (outcome == "group")
+    assert ("nothing is named" in text) == (outcome in ("none", "unknown"))
+    if outcome == "group":
+        assert "do not tell air drag from quadratic air drag" in text
+    if d.next_motion is not None:
+        assert d.next_motion["name"] in text
