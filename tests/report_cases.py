@@ -91,7 +91,7 @@ def judged(twin: Twin, id: str, coefficient: float, width: float, gain: Sequence
 
 
 def answer(twin: Twin, episodes: Sequence[Episode], outcome: str = "named", width: float = 0.1) -> Diagnosis:
-    """A diagnosis of `episodes` (three of them 'test'): linear drag, with quadratic drag behind it."""
+    """A diagnosis of `episodes`, errors on those that are 'test' or on all: linear drag, quadratic drag behind it."""
     count = sum(e.split != "ood" for e in episodes)
     gains = np.linspace(1.0, 2.0, count)
     first = judged(twin, "drag_linear", LINEAR, width, gains.tolist())
@@ -104,9 +104,9 @@ def answer(twin: Twin, episodes: Sequence[Episode], outcome: str = "named", widt
     cause = Cause("drag_linear", "drag", 0.9, {"coefficient": span}, False, 0.9, 0.001, group)
     named = outcome in ("named", "group")
     found = twin.replace(extensions=drag()) if named else twin
-    test = [e for e in episodes if e.split == "test"]
+    test = [e for e in episodes if e.split == "test"] or list(episodes)
     base, extended = episode_errors(twin, test), episode_errors(found, test)
-    errors = Errors("test", base, extended, 1.0, gain_of(base, extended, 0))
+    errors = Errors(test[0].split, base, extended, 1.0, gain_of(base, extended, 0))
     spans = {"delay": ((-0.002, 0.004),)}
     delay = GateCause("delay", False, True, "small", "s", {"delay": (0.001,)}, spans, 0.5, 0.9, 0.2)
     gate = GateResult(
