@@ -20,7 +20,7 @@ from pred_core.identify.space import SearchSpace
 from pred_core.types import Array
 
 STEP = 0.05  # of a difference, in coordinates (typical changes)
-LONGEST = 2.0  # coordinates a step
+LONGEST = 2.0  # coordinates a step; twice as many after each step that was cut and helped
 PATIENCE = 5  # times the damping is raised before giving up
 CONVERGED = 2e-4  # relative change of the loss
 PRIOR = 1e-4  # pull of a coordinate towards its start, a typical change squared, as a loss: breaks ties
@@ -123,7 +123,7 @@ def fit(
     z = np.clip(np.asarray(z, dtype=np.float64), lower, upper)
     origin = z.copy()
     use = np.ones(target.roller.sample.episodes, dtype=bool) if chosen is None else chosen
-    damping = 1e-2
+    damping, longest = 1e-2, LONGEST
     limit = most * max(target.roller.demand(space.candidate(z)), target.roller.usual())
     loss, gradient, curvature, substeps = target.linearize(space, z)
     for _ in range(iterations):
@@ -133,7 +133,7 @@ def fit(
         found = None
         for _ in range(PATIENCE):
             move = -np.linalg.solve(h + damping * np.diag(np.diag(h)) + 1e-12 * np.eye(len(z)), g)
-            trial = np.clip(z + np.clip(move, -LONGEST, LONGEST), lower, upper)
+            trial = np.clip(z + np.clip(move, -longest, longest), lower, upper)
             if target.roller.demand(space.candidate(trial)) > limit:
                 damping *= 8.0
                 continue
@@ -142,8 +142,9 @@ def fit(
             after = float(tried[use].mean()) + 0.5 * PRIOR * float(((trial - origin) ** 2).sum())
             if after < before:
                 found = trial
+                longest *= 2.0 if np.abs(move).max() > longest else 1.0
                 break
-            damping *= 8.0
+            damping, longest = damping * 8.0, LONGEST
         if found is None:
             break
         z, damping = found, max(damping / 6.0, 1e-6)

@@ -20,6 +20,7 @@ from pred_core.twin import Twin
 from pred_core.types import Array
 
 KEPT_STARTS = 4
+ON_THE_WAY, STILL_FALLING = 3, 0.75  # times these steps are taken again, while the loss falls to this share
 QUICK, TRIED = 2, 2  # steps, and starts, of a candidate before it is told whether it goes on
 Tell = Callable[[str], None]
 Effects = tuple[type[Effect], ...]
@@ -86,6 +87,12 @@ def quick(bench: Bench, screened: Screened, journal: Journal, key: str) -> tuple
     def find() -> list[object]:
         ends = [fit(bench.fitted, screened.trial.space, s.z, QUICK) for s in screened.starts[:TRIED]]
         best = min(ends, key=lambda f: float(f.loss.mean()))
+        before = float("inf")
+        for _ in range(ON_THE_WAY):  # a strong cause is far from off: as long as it gains much, it is not there yet
+            if float(best.loss.mean()) > STILL_FALLING * before:
+                break
+            before = float(best.loss.mean())
+            best = fit(bench.fitted, screened.trial.space, best.z, QUICK)
         return [best.z.tolist(), float(best.loss.mean())]
 
     z, loss = journal.once(key, find)

@@ -18,12 +18,22 @@ from pred_core.types import Array
 NAMED = ("#009E73", "#0072B2", "#CC79A7", "#56B4E9", "#5D3A9B", "#1b9e9e", "#8C564B", "#B07C00")
 LEARNED, UNEXPLAINED, FLOOR, OTHER = "#E6B800", "#D55E00", "#b8c0c8", "#7a7a7a"
 MOST_LABELS = 60
+LITTLE = 0.05  # of the base's loss: a smaller excess is nothing to take shares of
+
+
+def whole_of(seen: Round) -> tuple[float, str]:
+    """What gains are shares of: the excess over the reference, or the base's loss where there is next to no excess."""
+    base = float(seen.base.mean())
+    excess = base - seen.floor
+    if excess > LITTLE * base:
+        return excess, "the base's mean excess loss"
+    return max(base, 1e-9), "the base's mean loss, which exceeds the reference's by next to nothing"
 
 
 def evidence(seen: Round, words: dict[str, str], named: Judged | None, seed: int) -> Figure:
-    """What each fitted candidate saves on episodes it did not see, as share of the excess; dots are episodes."""
+    """What each fitted candidate saves on episodes it did not see, as share of `whole_of`; dots are episodes."""
     judged = sorted((j for j, _, _ in seen.judged), key=lambda j: j.mean)
-    excess = max(float(seen.base.mean()) - seen.floor, 1e-9)
+    excess, of = whole_of(seen)
     figure = Figure(figsize=(9.5, 0.9 + 0.36 * len(judged)), layout="constrained")
     axes = figure.subplots()
     axes.axvline(0.0, color=GREY, linewidth=0.9)
@@ -39,7 +49,7 @@ def evidence(seen: Round, words: dict[str, str], named: Judged | None, seed: int
     axes.set_ylim(-0.6, len(judged) - 0.4)
     every = 100.0 * np.concatenate([j.gain for j in judged]) / excess
     axes.set_xlim(max(float(every.min()) - 5.0, -150.0), min(float(every.max()) + 5.0, 400.0))
-    tidy(axes, "saved on episodes it was not fitted on [% of the mean excess loss]", "")
+    tidy(axes, f"saved on episodes it was not fitted on [% of {of}]", "")
     axes.grid(False, axis="y")
     axes.tick_params(axis="y", colors=INK)
     return figure
@@ -56,7 +66,8 @@ def by_episode(parts: Sequence[Errors]) -> Figure:
         y = np.arange(len(order))
         axes.hlines(y, np.minimum(before, after), np.maximum(before, after), color=GRID, linewidth=3)
         axes.scatter(before, y, s=26, color=COLORS["base"], label="base", zorder=3)
-        axes.scatter(after, y, s=26, marker="s", color=COLORS["extended"], label="extended", zorder=4)
+        if not np.array_equal(before, after):
+            axes.scatter(after, y, s=26, marker="s", color=COLORS["extended"], label="extended", zorder=4)
         if part.floor is not None:
             axes.axvline(part.floor, color=COLORS["reference"], linestyle="--", linewidth=1.2, label="reference (mean)")
         names = [part.base.names[k] for k in order]

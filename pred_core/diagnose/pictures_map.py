@@ -72,8 +72,9 @@ def seen_from_above(replays: Sequence[Replay]) -> Figure:
     x, y = grid_of(replays)
     maps = [from_above(r, x, y) for r in replays]
     # One bad cell must not make all others pale.
-    most = float(np.nanquantile(np.concatenate([m.mean.ravel() for m in maps[:2]]), 0.97))
-    pulls = np.concatenate([m.pull.reshape(-1, 2) for m in maps[:2]])
+    own = [m for m, r in zip(maps, replays, strict=True) if r.name != "reference"]
+    most = float(np.nanquantile(np.concatenate([m.mean.ravel() for m in own]), 0.97))
+    pulls = np.concatenate([m.pull.reshape(-1, 2) for m in own])
     longest = float(np.nanquantile(np.linalg.norm(pulls, axis=-1), 0.95))
     height = 1.2 + 3.9 * min(max(np.ptp(y) / np.ptp(x), 0.45), 1.6)
     figure = Figure(figsize=(4.2 * len(maps) + 0.8, height), layout="constrained")

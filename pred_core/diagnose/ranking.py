@@ -10,6 +10,7 @@ from pred_core.diagnose.result import Ranked
 from pred_core.diagnose.rounds import Named, Round
 
 SHARP = 1.0  # how fast a rival's weight falls with the standard errors it is behind
+COLD = 0.8  # without a reference: what engine and object lack in common can look like a cause
 UNSEEN = 0.05  # probability left for "unknown" where nothing is seen, and for "none" where something is
 EXPLAINS = (0.45, 8.0)  # share of the excess closed at which "it explains it" is even, and how steeply that rises
 
@@ -18,6 +19,11 @@ def explains(closed: float) -> float:
     """Probability that a cause that closes this share of the excess is not a stand-in for something unknown."""
     middle, slope = EXPLAINS
     return 1.0 / (1.0 + math.exp(-slope * (min(closed, 1.2) - middle)))
+
+
+def confidence(named: Named, floor: bool) -> float:
+    """Probability that a name stands for what is there. Without a floor nobody knows how much there is to explain."""
+    return (explains(named.closed) if floor else COLD) * (1.0 - min(named.p_adjusted, 1.0))
 
 
 def ranking(rounds: Sequence[Round], named: Sequence[Named], unknown: bool) -> list[Ranked]:
@@ -33,7 +39,7 @@ def ranking(rounds: Sequence[Round], named: Sequence[Named], unknown: bool) -> l
     p = {j.trial.id: (q, why) for j, q, why in first.judged}
     allowed = {k: w for k, w in weight.items() if not p[k][1] or (chosen is not None and k == best.trial.id)}
     total = sum(allowed.values()) or 1.0
-    sure = 0.0 if chosen is None else explains(chosen.closed) * (1.0 - min(chosen.p_adjusted, 1.0))
+    sure = 0.0 if chosen is None else confidence(chosen, rounds[0].floor > 0.0)
     rows = [
         Ranked(
             id=j.trial.id,

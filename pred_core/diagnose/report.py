@@ -54,13 +54,12 @@ def write_report(
 
 
 def replays(d: Diagnosis, episodes: Sequence[Episode], reference: Sequence[Episode] | None) -> list[Replay]:
-    """Base and extended over the train and test episodes, and the base over the reference's."""
+    """Base and, if anything was named, extended over the train and test episodes; the base over the reference's."""
     mine = [e for e in episodes if e.split != "ood"]
     begin = min(int(e.stamps[0]) for e in mine)
-    rows = [
-        replay("base", d.base_twin, mine, _given(d), begin),
-        replay("extended", d.twin, mine, d.twin.calibration, begin),
-    ]
+    rows = [replay("base", d.base_twin, mine, _given(d), begin)]
+    if d.causes:
+        rows.append(replay("extended", d.twin, mine, d.twin.calibration, begin))
     known = [e for e in reference or () if e.split != "ood"]
     if known:
         rows.append(replay("reference", d.base_twin, known, _given(d)))
@@ -75,7 +74,7 @@ def _given(d: Diagnosis) -> Calibration:
 def _map(page: Page, d: Diagnosis, episodes: Sequence[Episode], reference: Sequence[Episode] | None) -> None:
     page.heading("Where and when the error sits")
     rows = replays(d, episodes, reference)
-    also = " Reference: the base on the reference's episodes." if len(rows) > 2 else ""
+    also = " Reference: the base on the reference's episodes." if rows[-1].name == "reference" else ""
     page.figure(
         pictures_map.curves(rows, d.seed),
         f"Mean error of train and test episodes, restarted from data every {WINDOW:g} s so that it is seen where it "
@@ -102,12 +101,13 @@ def _overlay(page: Page, d: Diagnosis, episodes: Sequence[Episode]) -> None:
     extended, corrected = predicted(d.twin, d.twin.calibration.correct(episode))
     frames = min(len(base), len(extended))
     held = "held-out " if d.errors.split == "test" else ""
-    page.heading(f"Before and after: {held}episode {name}")
+    page.heading(f"{'Before and after: ' if d.causes else 'As it is: '}{held}episode {name}")
     tracks: list[tuple[str, Array, str]] = [("measured", measured[:frames], INK)]
     if np.nanmax(np.linalg.norm(corrected[:frames] - measured[:frames], axis=-1), initial=0.0) > MOVED:
         tracks.append(("measured, corrected", corrected[:frames], pictures.NAMED[1]))
-    tracks += [("base", base[:frames], pictures_map.COLORS["base"]),
-               ("extended", extended[:frames], pictures_map.COLORS["extended"])]  # fmt: skip
+    tracks.append(("base", base[:frames], pictures_map.COLORS["base"]))
+    if d.causes:
+        tracks.append(("extended", extended[:frames], pictures_map.COLORS["extended"]))
     line, period = d.base_twin.body.kind == "line", d.base_twin.meta.period
     k = names.index(name)
     page.figure(

@@ -95,7 +95,7 @@ def add_evidence(page: Page, d: Diagnosis) -> None:
 def _round_table(page: Page, d: Diagnosis, n: int, named: Judged | None) -> None:
     """All candidates fitted in a round; in the first also their probabilities, with "unknown" and "nothing"."""
     seen = d.rounds[n]
-    excess = max(float(seen.base.mean()) - seen.floor, 1e-9)
+    excess, _ = pictures.whole_of(seen)
     probability = {r.id: f"{r.probability:.2f}" for r in d.ranking} if n == 0 else {}
     ids = [j.trial.id for j, _, _ in seen.judged]
     rows, marks = [], []

@@ -27,6 +27,9 @@ FEW, FINALISTS = 2, 5  # candidates that are fitted to the end: at least, and at
 BEHIND = 0.35  # share of the leader's gain below which the others are not
 UNEXPLAINED = 3.0  # times the loss of noise: without a reference, what is left is then worth saying
 NOISE = 0.4  # loss of residuals that are noise: the mean of rho(u) for u ~ N(0, 1) is 0.36
+FEWEST = 10  # episodes for inference; fewer are exploratory
+EXPLORATORY = 0.5  # share of the excess a cause must close to be named from fewer
+CLOSE = 0.6  # share of the promise of its family's leader from which a candidate is kept beside it
 PAIRED = 5  # candidates whose pairs are tried
 STANDING = 0.05  # of the floor: a gain below is not worth a name, whatever its significance
 
@@ -149,6 +152,9 @@ def finish(progress: Progress) -> None:
         progress.unknown = not progress.named and float(bench.standing().mean()) > UNEXPLAINED * NOISE
         return
     suspect, reference = bench.standing(), _reference_losses(bench)
+    if min(len(suspect), len(reference)) < FEWEST:
+        progress.unknown = not progress.named and float(suspect.mean()) > UNEXPLAINED * float(reference.mean())
+        return
     p = lack_of_fit(
         suspect, reference, bench.config.seed, on_ground(bench.target.roller), on_ground(bench.reference.roller)
     )
@@ -174,13 +180,15 @@ def _reference_losses(bench: Bench) -> Array:
 
 
 def _survivors(screened: list[Screened], count: int, least: float) -> list[Screened]:
-    """The most promising ones, and the best of every family that promises anything."""
-    kept = [s for s in screened[:count] if s.promise > least]
-    families = {s.trial.family for s in kept}
-    for s in screened[count:]:
-        if s.trial.family not in families and s.promise > least:
-            kept.append(s)
-            families.add(s.trial.family)
+    """The most promising ones, the best of every family that promises anything, and who is close to it."""
+    leader: dict[str, float] = {}
+    for s in screened:
+        leader.setdefault(s.trial.family, s.promise)
+    kept = [
+        s
+        for n, s in enumerate(screened)
+        if s.promise > least and (n < count or s.promise >= CLOSE * leader[s.trial.family])
+    ]
     return kept or screened[:2]
 
 
@@ -226,6 +234,10 @@ def _why_not(j: Judged, p: float, excess: float, floor: float, progress: Progres
     whole = excess if first is None or cold else max(float(first.base.mean()) - first.floor, excess)
     least = max((config.cold_gate if cold else config.gate) * whole, STANDING * floor)
     better, acting = j.improved
+    if len(j.gain) < FEWEST:  # no inference from so few: what helps everywhere, and much, is named as exploratory
+        if acting == 0 or better < acting:
+            return f"{better} of {acting} episodes improve"
+        return "" if j.mean >= max(EXPLORATORY * whole, least) else f"saves too little ({j.mean:.3f} of the loss)"
     if acting < 4:
         return f"acts in {acting} episodes only"
     if p > config.level:

@@ -14,9 +14,9 @@ from pred_core.diagnose.gate import GateCause, GateResult, measure
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Bench, Tell
 from pred_core.diagnose.next_motion import propose
-from pred_core.diagnose.ranking import explains, ranking
+from pred_core.diagnose.ranking import confidence, ranking
 from pred_core.diagnose.result import Cause, Diagnosis, Errors, Value
-from pred_core.diagnose.rounds import Named, Progress, finish, one_round
+from pred_core.diagnose.rounds import FEWEST, Named, Progress, finish, one_round
 from pred_core.diagnose.said import not_identifiable, sentence
 from pred_core.diagnose.structure import FAMILY, ID, applies, question
 from pred_core.effects import find_effect
@@ -24,7 +24,6 @@ from pred_core.errors import DatasetError
 from pred_core.twin import Extension, Twin
 from pred_core.types import Episode
 
-FEWEST = 10  # train and test episodes for inference; fewer are exploratory
 MEASURED = ("delay", "camera_scale", "camera_rotation", "camera_translation", "gripper_offset")
 
 
@@ -44,11 +43,11 @@ def diagnose(
     """
     begin = time.monotonic() if begin is None else begin
     train = [e for e in episodes if e.split == "train"]
-    if len(train) < 2:
+    if not train:
         raise DatasetError(
-            "too few episodes to diagnose",
-            got=f"{len(train)} with split 'train'",
-            allowed="2 or more; 10 for a name that holds",
+            "there is nothing to fit a cause to",
+            got="no episode with split 'train'",
+            allowed="1 or more; 10 train and test episodes for a name that holds",
             next_step="Record more episodes with different motions",
         )
     known = [e for e in reference or () if e.split != "ood"]
@@ -99,7 +98,7 @@ def _answer(
     tell: Tell,
 ) -> Diagnosis:
     final = progress.bench.twin
-    causes = (*_measured(gate), *_named(progress.named))
+    causes = (*_measured(gate), *_named(progress.named, first.reference is not None))
     extended = final.replace(extensions=tuple(_evidence(e, progress.named) for e in final.extensions))
     base = first.twin
     split = "test" if any(e.split == "test" for e in corrected) else "train"
@@ -170,14 +169,14 @@ def _gate_values(cause: GateCause) -> dict[str, Value]:
     return rows
 
 
-def _named(named: Sequence[Named]) -> list[Cause]:
+def _named(named: Sequence[Named], floor: bool) -> list[Cause]:
     rows = []
     for n in named:
         j = n.judged
         if j.trial.ids == (ID,):
             name = j.trial.space.knobs[0].name
             value = Value(j.values[name], j.trial.space.knobs[0].unit, *j.intervals[name])
-            rows.append(Cause(ID, FAMILY, explains(n.closed), {name: value}, False, n.closed, n.p_adjusted))
+            rows.append(Cause(ID, FAMILY, confidence(n, floor), {name: value}, False, n.closed, n.p_adjusted))
             continue
         for id in j.trial.ids:
             effect = find_effect(id)
@@ -192,7 +191,7 @@ def _named(named: Sequence[Named]) -> list[Cause]:
                     j.values[knob.name], knob.unit, low, high, j.at_bound[knob.name]
                 )
             rows.append(
-                Cause(id, effect.family, explains(n.closed), values, False, n.closed, n.p_adjusted, n.group)
+                Cause(id, effect.family, confidence(n, floor), values, False, n.closed, n.p_adjusted, n.group)
             )
     return rows
 
