@@ -13,6 +13,7 @@ from pred_core.calibration import Calibration
 from pred_core.diagnose.chosen import chosen_of
 from pred_core.diagnose.map import FEATURES, Replay, conditional, edges_of, from_above, grid_of, replay
 from pred_core.diagnose.next_motion import propose
+from pred_core.diagnose.pictures import whole_of
 from pred_core.diagnose.report import write_report
 from pred_core.diagnose.report_parts import budget_rows
 from pred_core.effects import find_effect
@@ -21,7 +22,7 @@ from pred_core.types import Episode
 
 SPLITS = ("train",) * 5 + ("test",) * 3
 SECTIONS = (
-    "Where and when the error sits", "Evidence: what explains it, and what does not", "Before and after",
+    "Where and when the error sits", "Evidence: what explains it, and what does not", "{before}",
     "Errors by episode", "Error budget", "Measured without the simulation", "What cannot be told apart",
     "The motion that would tell it apart", "With and without a network", "How it was made",
 )  # fmt: skip
@@ -135,6 +136,14 @@ def test_a_cause_of_measurement_is_shown_beside_the_raw_tracks(
     assert "measured, corrected" in (tmp_path / "report.html").read_text("utf-8")
 
 
+def test_shares_are_of_the_excess_unless_there_is_none(twin: Twin, dragged: list[Episode]) -> None:
+    """Losses of 2.0 over a floor of 0.2: shares of 1.8. Over 1.99, or above: shares of 2.0, not of nothing."""
+    seen = answer(twin, dragged).rounds[0]
+    assert whole_of(seen)[0] == pytest.approx(1.8)
+    for floor in (1.99, 2.5):
+        assert whole_of(dataclasses.replace(seen, floor=floor))[0] == pytest.approx(2.0)
+
+
 def test_a_report_of_one_episode_is_written(twin: Twin, tmp_path: Path) -> None:
     """Fewer than any interval needs: bins are drawn from what there is, and it says that there is no interval."""
     episodes = recorded(twin, drag(), ("train",))
@@ -142,7 +151,7 @@ def test_a_report_of_one_episode_is_written(twin: Twin, tmp_path: Path) -> None:
     d = dataclasses.replace(d, next_motion=propose(d, episodes))
     write_report(tmp_path / "report.html", d, episodes, None, "pred diagnose")
     text = (tmp_path / "report.html").read_text("utf-8")
-    assert "One episode: no interval." in text and all(f"<h2>{s}" in text for s in SECTIONS)
+    assert "One episode: no interval." in text and all(f"<h2>{s}" in text for s in SECTIONS if "{" not in s)
 
 
 def test_a_change_of_structure_is_told_though_no_round_tried_it(
@@ -173,7 +182,8 @@ def test_a_report_opens_with_its_sentence_and_has_every_section(
     write_report(path, d, dragged, known, "pred diagnose <data>", network if outcome == "group" else None)
     text = path.read_text("utf-8")
     assert text.index(d.sentence) < text.index("<h2>")
-    places = [text.index(f"<h2>{s}") for s in SECTIONS]
+    before = "Before and after" if outcome in ("named", "group") else "As it is"
+    places = [text.index(f"<h2>{s.format(before=before)}") for s in SECTIONS]
     assert places == sorted(places)
     assert "measured, corrected" not in text
     assert "pred diagnose &lt;data&gt;" in text and "src=\"http" not in text
