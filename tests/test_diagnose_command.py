@@ -1,0 +1,315 @@
+"""`pred diagnose`: what it writes, what it says of few episodes, and one clear line for bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from plant_cases import hurry
+from report_cases import PERIOD, drag, recorded, rope
+
+from pred_core.bag.dataset import EpisodeEntry, write_dataset
+from pred_core.bag.episode import write_episode
+from pred_core.cli.main import main
+from pred_core.plant.session import SessionConfig
+from pred_core.plant.springs import Line, SpringsConfig, write_springs_case
+from pred_core.pred import load_dynamics
+from pred_core.springmass import build_body
+from pred_core.twin import Twin, TwinMeta
+from pred_core.types import Array, Episode, ObjectInfo, Physics, Scene, State
+
+SPLITS = ("train",) * 5 + ("test",)
+FAST = ["--places", "4", "--survivors", "3", "--iterations", "6"]
+
+
+def write(root: Path, episodes: Sequence[Episode], rate: float = 30.0, name: str = "rope") -> Path:
+    """The episodes as a data set of bags."""
+    entries = []
+    for e in episodes:
+        write_episode(root / f"{e.name}.mcap", e)
+        entries.append(EpisodeEntry(f"{e.name}.mcap", e.split, e.recording))
+    write_dataset(
+        root, object=ObjectInfo(name, "line"), rate=rate, entries=entries, held={0: 0}, known={"mass": 0.05}
+    )
+    return root
+
+
+@pytest.fixture(scope="module")
+def dragged() -> list[Episode]:
+    return recorded(rope(), drag(), SPLITS, seed=0, frames=40)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory, dragged: list[Episode]) -> Path:
+    """`twin`, `suspect` with a drag of 1.5 /s, `reference` without."""
+    root = tmp_path_factory.mktemp("diagnose")
+    rope().save(root / "twin")
+    write(root / "suspect", dragged)
+    write(root / "reference", recorded(rope(), (), SPLITS, seed=100, frames=40))
+    return root
+
+
+def diagnose(dataset: Path, twin: Path, out: Path, *flags: str) -> int:
+    return main(["diagnose", str(dataset), "--twin", str(twin), "--out", str(out), *FAST, *flags])
+
+
+@pytest.fixture(scope="module")
+def found(world: Path) -> Path:
+    """Where the answer about the dragged rope is."""
+    assert diagnose(world / "suspect", world / "twin", world / "out", "--reference", str(world / "reference")) == 0
+    return world / "out"
+
+
+def read(out: Path) -> dict[str, Any]:
+    return dict(json.loads((out / "diagnosis.json").read_text()))
+
+
+def test_the_answer_has_what_the_design_says(found: Path) -> None:
+    d = read(found)
+    assert d["outcome"] == "named" and isinstance(d["sentence"], str)
+    (cause,) = d["causes"]
+    assert cause["id"] == "drag_linear" and cause["family"] == "drag" and 0.5 < cause["probability"] <= 1.0
+    value = cause["parameters"]["coefficient"]
+    assert value["unit"] == "1/s" and value["at_bound"] is False
+    assert value["value"] == pytest.approx(1.5, rel=0.02) and value["low"] < value["value"] < value["high"]
+    assert isinstance(d["group"], list) and isinstance(d["not_identifiable"], list)
+    assert all(isinstance(r["id"], str) and 0.0 <= r["probability"] <= 1.0 for r in d["ranking"])
+    assert sum(r["probability"] for r in d["ranking"]) == pytest.approx(1.0, abs=0.02)
+    error = d["error_mm"]
+    assert error["split"] == "test" and error["extended"] < 0.2 * error["base"] and error["floor"] > 0.0
+    assert error["base"] == pytest.approx(np.mean([e[0] for e in error["episodes"].values()]))
+    assert d["error_mm_ood"] == {}
+    gain = d["gain"]
+    assert gain["mean_mm"] == pytest.approx(error["base"] - error["extended"])
+    assert gain["low_mm"] <= gain["mean_mm"] <= gain["high_mm"]
+    assert gain["episodes_improved"] == "1/1" and 0.0 < gain["p_adjusted"] <= 1.0
+    budget = d["budget"]
+    assert set(budget) == {"named", "learned", "unexplained", "floor"} and budget["learned"] == 0.0
+    parts = sum(budget["named"].values()) + budget["learned"] + budget["unexplained"] + budget["floor"]
+    assert parts == pytest.approx(error["base"])  # it adds up
+    assert d["next_motion"] is None or isinstance(d["next_motion"], dict)
+    assert d["seconds"] > 0.0 and d["seed"] == 0
+
+
+def test_few_episodes_are_labelled_exploratory(found: Path) -> None:
+    """Six of the ten that a name that holds needs."""
+    d = read(found)
+    assert d["exploratory"] is True and d["sentence"].startswith("Exploratory")
+    assert "drag" in d["sentence"] and "1 of 1 episodes" in d["sentence"]
+    shown = float(re.search(r"drag: ([\d.]+) 1/s", d["sentence"])[1])  # type: ignore[index]
+    assert shown == pytest.approx(d["causes"][0]["parameters"]["coefficient"]["value"], rel=0.01)
+
+
+def test_one_train_episode_is_exploratory(world: Path, tmp_path: Path, dragged: list[Episode]) -> None:
+    """It is fitted on one motion and judged on two others, and says how little that is."""
+    three = [dataclasses.replace(e, split="train" if n == 0 else "test") for n, e in enumerate(dragged[:3])]
+    data = write(tmp_path / "data", three)
+    assert diagnose(data, world / "twin", tmp_path / "out", "--reference", str(world / "reference")) == 0
+    d = read(tmp_path / "out")
+    assert d["exploratory"] is True and d["sentence"].startswith("Exploratory")
+    assert any("exploratory" in note for note in d["notes"])
+    for cause in d["causes"]:  # one recording has no scatter: no interval narrower than what is allowed
+        assert all(v["high"] - v["low"] > abs(v["value"]) for v in cause["parameters"].values())
+
+
+def test_the_extended_twin_is_a_twin(found: Path, world: Path, dragged: list[Episode]) -> None:
+    """It runs as it is, slower through the air than its base, and tells why it carries what it carries."""
+    twin = Twin.load(found / "twin")
+    (extension,) = twin.extensions
+    assert extension.id == "drag_linear" and twin.meta.parent == Twin.load(world / "twin").digest()
+    assert twin.base is not None and not twin.base.extensions
+    assert "diagnose" in twin.meta.created_by
+    evidence = extension.evidence
+    assert evidence["found_by"] == "pred diagnose" and evidence["episodes_improved"] == "6/6"
+    assert 0.0 < evidence["p_adjusted"] < 0.05 and evidence["closed"] == pytest.approx(1.0, abs=0.1)
+    low, high = evidence["interval"]["drag_linear.coefficient[0]"]
+    assert low < 1.5 < high
+    e = dragged[0]
+    moving = torch.zeros(10, 3)
+    moving[1:, 0] = 1.0  # [m/s]
+    state = State(torch.as_tensor(e.position[0]).float(), moving, torch.as_tensor(e.held))
+    tips = []
+    for dynamics in (load_dynamics(twin), load_dynamics(twin, extensions=False)):
+        after = dynamics.step(dynamics.start(state, e.grips.at(0)), e.grips.at(1))
+        assert torch.isfinite(after.position).all() and dynamics.period == pytest.approx(PERIOD)
+        tips.append(float(after.position[-1, 0]))
+    assert 0.0 < tips[0] < tips[1]  # 1.5 /s over 1/30 s: 2.5 % less of 33 mm
+
+
+def test_run_again_it_says_the_same_at_once(found: Path, world: Path) -> None:
+    before, pieces = read(found), (found / "journal.jsonl").read_text()
+    assert diagnose(world / "suspect", world / "twin", found, "--reference", str(world / "reference")) == 0
+    again = read(found)
+    assert (found / "journal.jsonl").read_text() == pieces  # nothing was computed anew
+    assert {k: v for k, v in again.items() if k != "seconds"} == {k: v for k, v in before.items() if k != "seconds"}
+
+
+def test_a_gripper_that_stands_still_tests_nothing(world: Path, tmp_path: Path) -> None:
+    """Not testable, rather than absent: a delay of a gripper that rests cannot show."""
+    still = write(tmp_path / "still", recorded(rope(), (), SPLITS, seed=5, frames=30, size=0.0))
+    assert diagnose(still, world / "twin", tmp_path / "out", "--reference", str(world / "reference")) == 0
+    d = read(tmp_path / "out")
+    assert {"delay", "camera_scale"} <= set(d["not_testable"])
+    assert any("stands still" in line for line in d["not_identifiable"])
+    assert not any(c["kind"] == "measurement" for c in d["causes"])
+
+
+# Bad input ------------------------------------------------------------------------------------------------------------
+
+
+def refusal(capsys: pytest.CaptureFixture[str], dataset: Path, twin: Path, out: Path, *flags: str) -> str:
+    """The one line of a diagnosis that must fail; lines of progress, "[  1 s] ...", may stand before it."""
+    capsys.readouterr()
+    assert diagnose(dataset, twin, out, *flags) == 2
+    shown = capsys.readouterr()
+    lines = [line for line in shown.err.strip().splitlines() if not line.startswith("[")]
+    assert len(lines) == 1 and lines[0].startswith("pred: ") and not shown.out, shown
+    assert not (out / "diagnosis.json").exists() and not (out / "twin").exists()
+    return lines[0]
+
+
+def test_a_missing_twin_or_data_set(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "not a twin" in refusal(capsys, world / "suspect", tmp_path / "none", tmp_path / "out")
+    assert str(tmp_path / "none") in refusal(capsys, tmp_path / "none", world / "twin", tmp_path / "out")
+    gone = ("--reference", str(tmp_path / "none"))
+    assert str(tmp_path / "none") in refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", *gone)
+
+
+def other_rope(count: int, edge: float) -> Twin:
+    """Another object under the same name."""
+    rest = np.zeros((count, 3))
+    rest[:, 2] = -edge * np.arange(count)
+    physics = dataclasses.replace(rope().physics, connection_threshold=1.5 * edge)
+    return rope().replace(body=build_body("line", rest, 0.05, physics), physics=physics)
+
+
+def test_a_twin_of_another_object(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """More particles than are tracked; four times as long: 0.2 m too far a particle, below the half metre it counts."""
+    against = ("--reference", str(world / "reference"))
+    other_rope(14, 0.05).save(tmp_path / "more")
+    line = refusal(capsys, world / "suspect", tmp_path / "more", tmp_path / "out", *against)
+    assert "no id 10, 11, 12, 13" in line and "Identify a twin" in line
+    other_rope(10, 0.2).save(tmp_path / "longer")
+    line = refusal(capsys, world / "suspect", tmp_path / "longer", tmp_path / "out", *against)
+    assert "diverges or is not of this object" in line and "Identify a twin" in line
+
+
+def test_an_absurd_stiffness(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    twin = rope()
+    twin.replace(physics=dataclasses.replace(twin.physics, stiffness=1e9)).save(tmp_path / "twin")
+    line = refusal(capsys, world / "suspect", tmp_path / "twin", tmp_path / "out")
+    assert "physics.yaml: stiffness" in line and "allowed" in line
+
+
+def test_no_train_episode(
+    world: Path, tmp_path: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = write(tmp_path / "data", [dataclasses.replace(e, split="test") for e in dragged])
+    assert "'train'" in refusal(capsys, data, world / "twin", tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("flag", "value", "said"),
+    [("--level", "7", "level; got 7.0; allowed: 0.0001 to 0.5"), ("--seed", "1.5", "seed"),
+     ("--places", "many", "places; got 'many'"), ("--window", "-1", "window; got -1")],
+)  # fmt: skip
+def test_a_flag_with_a_bad_value(
+    flag: str, value: str, said: str, world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert said in refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", flag, value)
+
+
+def test_a_particle_that_is_never_measured(
+    world: Path, tmp_path: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one episode of six."""
+    e = dragged[2]
+    position, seen = e.position.copy(), e.tracks.visible.copy()
+    position[:, 5], seen[:, 5] = np.nan, False
+    tracks = dataclasses.replace(e.tracks, position=position, visible=seen, confidence=seen.astype(np.float32))
+    data = write(tmp_path / "data", [*dragged[:2], dataclasses.replace(e, tracks=tracks), *dragged[3:]])
+    assert e.name in refusal(capsys, data, world / "twin", tmp_path / "out")
+
+
+def test_a_reference_of_another_rate(
+    world: Path, tmp_path: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
+) -> None:
+    faster = []
+    for e in dragged:
+        stamps = e.stamps[0] + (e.stamps - e.stamps[0]) // 2
+        faster.append(dataclasses.replace(e, stamps=stamps, tracks=dataclasses.replace(e.tracks, stamp=stamps)))
+    against = ("--reference", str(write(tmp_path / "faster", faster, rate=60.0)))
+    line = refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", *against)
+    assert "period" in line and "0.01666" in line
+
+
+def test_a_damaged_journal(world: Path, found: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "out").mkdir()
+    text = (found / "journal.jsonl").read_text().splitlines()
+    text[3] = text[3][:30]
+    (tmp_path / "out" / "journal.jsonl").write_text("\n".join(text) + "\n")
+    against = ("--reference", str(world / "reference"))
+    line = refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", *against)
+    assert "journal.jsonl: is damaged" in line and "Delete it" in line
+
+
+# Another world of springs, in which the twin can be right -------------------------------------------------------------
+
+PARTICLES = 10
+SPRINGS = SpringsConfig(stiffness=60.0, damping=0.03, friction=0.5, reach=2, substeps=12)
+PLANTED = 3.0  # [1/s]
+
+
+def matched() -> Twin:
+    """The twin with the world's own parameters."""
+    spacing = SPRINGS.length / (PARTICLES - 1)
+    physics = Physics(
+        stiffness=SPRINGS.stiffness, damping=SPRINGS.damping, connection_threshold=2.5 * spacing, max_springs=4,
+        ground_friction=SPRINGS.friction,
+    )  # fmt: skip
+    rest = np.zeros((PARTICLES, 3))
+    rest[:, 0] = spacing * np.arange(PARTICLES)
+    body = build_body("line", rest, SPRINGS.mass, physics)
+    return Twin(TwinMeta(object=ObjectInfo("rope", "line"), period=1.0 / 30.0), body, physics, Scene(ground=0.0))
+
+
+@pytest.fixture(scope="module")
+def springs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """`twin`; data sets `reference`, `control` and `drag` of seven episodes of 2 s, each of other motions."""
+    root = tmp_path_factory.mktemp("springs")
+    matched().save(root / "twin")
+    session = SessionConfig(train=5, test=2, ood=0, seconds=2.0, particles=PARTICLES)
+    step = Line.step
+    with pytest.MonkeyPatch.context() as patch:
+        hurry(patch)
+        for seed, name in ((40, "reference"), (41, "control"), (43, "drag")):
+
+            def dragging(self: Line, x: Array, v: Array, held: Array, drag: float, h: float) -> tuple[Array, Array]:
+                return step(self, x, v, held, drag or PLANTED, h)
+
+            patch.setattr(Line, "step", dragging if name == "drag" else step)
+            write_springs_case(root / name, seed, lambda *_: None, session=session, springs=SPRINGS)
+    yield root
+
+
+def test_nothing_is_named_where_nothing_is_hidden(springs: Path, tmp_path: Path) -> None:
+    assert diagnose(springs / "control", springs / "twin", tmp_path, "--reference", str(springs / "reference")) == 0
+    d = read(tmp_path)
+    assert d["outcome"] == "none" and d["causes"] == [] and d["exploratory"] is True
+    assert "Nothing is found" in d["sentence"] and not Twin.load(tmp_path / "twin").extensions
+
+
+def test_drag_is_named_in_a_world_of_other_code(springs: Path, tmp_path: Path) -> None:
+    """Float64, finer steps, noise, drop-outs and jitter of a tracker; exploratory: 10 % from seven short episodes."""
+    assert diagnose(springs / "drag", springs / "twin", tmp_path, "--reference", str(springs / "reference")) == 0
+    d = read(tmp_path)
+    assert d["outcome"] in ("named", "group") and d["exploratory"] is True
+    assert d["causes"][0]["id"] == "drag_linear"
+    assert d["causes"][0]["parameters"]["coefficient"]["value"] == pytest.approx(PLANTED, rel=0.1)
