@@ -72,8 +72,11 @@ def _write_next_motion(path: Path, answer: Diagnosis) -> None:
 
 def _header(dataset: Dataset, reference: Dataset | None, twin: Twin, config: DiagnoseConfig) -> dict[str, object]:
     sets = [dataset] if reference is None else [dataset, reference]
-    hashes = [[s.sha256(e) + e.split for e in s.entries] for s in sets]
-    return {"data": hashes, "twin": twin.digest(), "config": repr(config), "version": 1}
+    hashes = [[s.sha256(e) for e in s.entries] for s in sets]
+    facts = [repr((s.entries, s.held, s.gravity, s.known, s.sigma)) for s in sets]
+    plain = dataclasses.replace(config, seconds=DiagnoseConfig().seconds)
+    asked = {"twin": twin.digest(), "levers": repr(twin.meta.levers), "config": repr(plain), "version": 2}
+    return {"data": hashes, "facts": facts, **asked}
 
 
 def _words(args: argparse.Namespace) -> list[str]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.fit import Target, fit
@@ -19,8 +20,8 @@ from pred_core.diagnose.weigh import misfit_of, seen_of, weigh
 from pred_core.effects import find_effect
 from pred_core.errors import DatasetError
 from pred_core.identify.space import Candidate
-from pred_core.twin import Twin
-from pred_core.types import Array, Episode, Physics
+from pred_core.twin import Extension, Twin
+from pred_core.types import Episode, Physics
 
 BASE = ("stiffness", "ground_friction", "bending_stiffness")  # refined; axial damping does not show
 ROOM = 1.15  # times the substeps of the given twin that the refined one may need
@@ -45,16 +46,19 @@ def commission(
     config: DiagnoseConfig,
     tell: Tell,
     journal: Journal,
+    session: int | None = None,
 ) -> Bench:
     """The bench. With a reference the base is refined on it and frozen; without one, on the suspect set's train
     episodes, and every candidate refits it.
 
     Raises: DatasetError if the twin does not describe the data at all.
     """
-    sample = make_sample(suspect, twin, config.window)
+    sample = make_sample(suspect, twin, config.window, session)
     known = make_sample(reference, twin, config.window) if reference else None
     judged_on = known or sample
-    use = np.array([s == "train" for s in judged_on.splits]) if known is None else None
+    use = np.array([s == "train" for s in judged_on.splits])
+    if not use.any():  # a reference of test episodes alone
+        use[:] = True
     _check(Roller(twin, judged_on), judged_on, twin)
     twin = with_stored(twin, journal.once("base", lambda: values_of(_polish(twin, judged_on, use, config, tell))))
     roller = Roller(twin, judged_on)
@@ -79,7 +83,7 @@ def with_values(twin: Twin, candidate: Candidate) -> Twin:
     return twin.replace(physics=candidate.physics, extensions=_kept_evidence(twin, candidate))
 
 
-def _kept_evidence(twin: Twin, candidate: Candidate) -> tuple:  # type: ignore[type-arg]
+def _kept_evidence(twin: Twin, candidate: Candidate) -> tuple[Extension, ...]:
     known = {e.id: e.evidence for e in twin.extensions}
     return tuple(dataclasses.replace(e, evidence=known.get(e.id, {})) for e in candidate.extensions)
 
@@ -101,9 +105,9 @@ def with_stored(twin: Twin, values: dict[str, Any]) -> Twin:
     return twin.replace(physics=Physics(**values["physics"]), extensions=extensions)
 
 
-def _polish(twin: Twin, sample: Sample, use: Array | None, config: DiagnoseConfig, tell: Tell) -> Twin:
+def _polish(twin: Twin, sample: Sample, use: NDArray[np.bool_], config: DiagnoseConfig, tell: Tell) -> Twin:
     """The base and what it already carries, refined on the sample with the loss the candidates are judged by."""
-    chosen = np.ones(sample.episodes, dtype=bool) if use is None else use
+    chosen = use
     most = ROOM * Roller(twin, sample).usual()
     for _ in range(2):  # the weights follow the parameters
         roller = Roller(twin, sample)

@@ -1,4 +1,4 @@
-"""Errors in millimetres: whole episodes replayed open loop with a twin, as `pred evaluate` does."""
+"""Errors in millimetres: whole episodes replayed open loop with a twin."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ class EpisodeErrors:
 
     names: tuple[str, ...]
     values: Array  # (E,)
+    diverged: tuple[str, ...] = ()  # episodes in which the simulation was not finite, or FARTHEST away
 
     @property
     def mean(self) -> float:
@@ -31,14 +32,21 @@ class EpisodeErrors:
         return float(self.values.mean())
 
 
-def episode_errors(twin: Twin, episodes: Sequence[Episode], window: float = WHOLE) -> EpisodeErrors:
-    """Errors of these episodes; `window` [s]: with a new start from data every so often."""
-    sample = make_sample(episodes, twin, window)
+def episode_errors(twin: Twin, episodes: Sequence[Episode], begin: int | None = None) -> EpisodeErrors:
+    """Errors of these episodes. `begin` [ns]: when their session began, for what drifts over it.
+
+    Starts are estimated over several frames, as in the diagnosis; `pred evaluate` takes them raw from two.
+    """
+    sample = make_sample(episodes, twin, WHOLE, begin)
     roller = Roller(twin, sample)
-    error = roller.errors([Candidate(twin.physics, twin.extensions)])[0].norm(dim=-1).clamp_max(FARTHEST)
+    error = roller.errors([Candidate(twin.physics, twin.extensions)])[0]
+    far = (error.abs() >= FARTHEST).flatten(1).any(dim=1).double().numpy()
+    error = error.norm(dim=-1).clamp_max(FARTHEST)
     seen = sample.windows.seen.movedim(0, 1)
     mean = error.sum((1, 2)).double() / seen.sum((1, 2)).clamp_min(1)
-    return EpisodeErrors(sample.names, 1e3 * sample.per_episode(mean.numpy()))
+    bad = sample.per_episode(far) > 0.0
+    diverged = tuple(n for n, b in zip(sample.names, bad.tolist(), strict=True) if b)
+    return EpisodeErrors(sample.names, 1e3 * sample.per_episode(mean.numpy()), diverged)
 
 
 @dataclass(frozen=True)

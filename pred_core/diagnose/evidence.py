@@ -13,6 +13,7 @@ from pred_core.diagnose.trial import Trial
 from pred_core.types import Array
 
 FLIPS = 20_000
+FEWEST_GROUPS = 6  # 2^-6 is the smallest p value they can show
 ACTS = 0.1  # standard deviations of a residual by which a cause must move an episode to count as acting in it
 NESTED = 0.97  # of the best gain: with fewer parameters, so little less is the better name
 CONFIDENCE = 0.90  # of the set of causes that cannot be told apart
@@ -64,11 +65,18 @@ class Judged:
         return False
 
 
-def family_wise(judged: Sequence[Judged], seed: int) -> Array:
-    """(C,) p values, adjusted for the number of candidates: max-T over random sign flips (Westfall and Young 1993)."""
+def family_wise(judged: Sequence[Judged], seed: int, groups: NDArray[np.int64] | None = None) -> Array:
+    """(C,) p values, adjusted for these candidates: max-T over random sign flips (Westfall and Young 1993).
+
+    `groups` (E,): recordings, whose episodes are flipped together; from fewer than FEWEST_GROUPS, which cannot be
+    significant, episodes are flipped one by one.
+    """
     gains = np.stack([j.gain for j in judged])
     generator = np.random.default_rng(seed)
-    signs = generator.choice((-1.0, 1.0), size=(FLIPS, gains.shape[1]))
+    unit = np.arange(gains.shape[1]) if groups is None else np.unique(groups, return_inverse=True)[1]
+    if unit.max() + 1 < FEWEST_GROUPS:
+        unit = np.arange(gains.shape[1])
+    signs = generator.choice((-1.0, 1.0), size=(FLIPS, int(unit.max()) + 1))[:, unit]
     observed = _studentized(gains)
     scale = np.sqrt((gains**2).sum(axis=1))  # sum of squares does not change with signs
     sums = signs @ gains.T  # (F, C)

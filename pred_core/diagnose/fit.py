@@ -50,10 +50,10 @@ class Target:
         keep = sample.windows_of(episodes)
         return Target(Roller(self.roller.twin, sample.part(episodes)), self.weights[torch.as_tensor(keep)], self.stride)
 
-    def some(self, windows: Array) -> Target:
+    def some(self, windows: NDArray[np.int64]) -> Target:
         """Only some windows."""
-        sample = self.roller.sample
-        return Target(Roller(self.roller.twin, sample.some(windows)), self.weights[torch.as_tensor(windows)], self.stride)
+        roller = Roller(self.roller.twin, self.roller.sample.some(windows))
+        return Target(roller, self.weights[torch.as_tensor(windows)], self.stride)
 
     def losses(self, space: SearchSpace, points: Sequence[Array]) -> Array:
         """(C, E) losses of points."""
@@ -111,7 +111,7 @@ def fit(
     space: SearchSpace,
     z: Array,
     iterations: int,
-    chosen: Array | None = None,
+    chosen: NDArray[np.bool_] | None = None,
     most: float = MOST_FACTOR,
 ) -> Fit:
     """The local optimum near z, on all episodes or on `chosen` (E,) bool.

@@ -10,6 +10,7 @@ from typing import Any
 from pred_core.calibration import Calibration
 
 Range = tuple[float, float]
+SENSOR_IDS = ("delay", "camera_scale", "camera_rotation", "camera_translation", "gripper_offset")
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class GateResult:
     reference: int  # episodes it is compared with; 0: with the twin and with zero
     slides: Mapping[str, tuple[float, ...]]  # episode -> path [m] in the jaws every half second; if the rope slides
     notes: tuple[str, ...]
+
+    sensor_ids = SENSOR_IDS  # causes that are corrected where data enter; the others are physics
 
     @property
     def accepted(self) -> tuple[GateCause, ...]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Sequence
 
 from pred_core.diagnose.evidence import rivals
+from pred_core.diagnose.gate import GateResult
 from pred_core.diagnose.result import Ranked
-from pred_core.diagnose.rounds import Named, Round
+from pred_core.diagnose.rounds import Named, Progress, Round
 
 SHARP = 1.0  # how fast a rival's weight falls with the standard errors it is behind
 COLD = 0.8  # without a reference: what engine and object lack in common can look like a cause
@@ -18,29 +19,63 @@ EXPLAINS = (0.45, 8.0)  # share of the excess closed at which "it explains it" i
 def explains(closed: float) -> float:
     """Probability that a cause that closes this share of the excess is not a stand-in for something unknown."""
     middle, slope = EXPLAINS
-    return 1.0 / (1.0 + math.exp(-slope * (min(closed, 1.2) - middle)))
+    return 1.0 / (1.0 + math.exp(-slope * (min(closed, 1.0) - middle)))
 
 
 def confidence(named: Named, floor: bool) -> float:
     """Probability that a name stands for what is there. Without a floor nobody knows how much there is to explain."""
-    return (explains(named.closed) if floor else COLD) * (1.0 - min(named.p_adjusted, 1.0))
+    return explains(named.closed) if floor else COLD
 
 
-def ranking(rounds: Sequence[Round], named: Sequence[Named], unknown: bool) -> list[Ranked]:
-    """All candidates of the first round, then "unknown" and "none". `unknown`: something is left without a name."""
-    if not rounds or not rounds[0].judged:
-        return [Ranked("none", "none", 1.0, 0.0, 1.0, "")]
-    first = rounds[0]
-    excess = max(float(first.base.mean()) - first.floor, 1e-9)
+def ranking(gate: GateResult, progress: Progress) -> list[Ranked]:
+    """What was named, the finalists of the first round, "unknown" and "none".
+
+    Named causes have each their own probability: several can be there at once. The first round's candidates, unknown
+    and none share what is left by the causes named before it.
+    """
+    floor = progress.bench.reference is not None
+    before = [
+        Ranked(c.id, "", 1.0 - 0.5 * min(1.0, c.p_adjusted), 0.0, c.p_adjusted, "")
+        for c in gate.accepted
+        if c.id in gate.sensor_ids
+    ]
+    before += [_row(n, confidence(n, floor)) for n in progress.named if n.round < 0]
+    later = [_row(n, confidence(n, floor)) for n in progress.named if n.round > 0]
+    first = _first_round(progress, floor)
+    left = 1.0 - max((r.probability for r in before), default=0.0)
+    if before and not any(n.round == 0 for n in progress.named):
+        first = [dataclasses.replace(r, probability=r.probability * left) for r in first]
+    seen = {r.id for r in (*before, *later)}
+    return sorted((*before, *later, *(r for r in first if r.id not in seen)), key=lambda r: (-r.probability, -r.gain))
+
+
+def _row(n: Named, probability: float) -> Ranked:
+    return Ranked(n.judged.trial.id, n.judged.trial.family, probability, n.closed, n.p_adjusted, "", n.judged.values)
+
+
+def _first_round(progress: Progress, floor: bool) -> list[Ranked]:
+    chosen = next((n for n in progress.named if n.round == 0), None)
+    none = 0.0 if chosen is not None else UNSEEN if progress.unknown else 1.0 - UNSEEN
+    sure = 0.0 if chosen is None else confidence(chosen, floor)
+    end = [
+        Ranked("unknown", "unknown", max(0.0, 1.0 - sure - none), 0.0, 1.0, ""),
+        Ranked("none", "none", none, 0.0, 1.0, ""),
+    ]
+    if not progress.rounds or not progress.rounds[0].judged:
+        return end
+    return [*_finalists(progress.rounds[0], chosen, sure), *end]
+
+
+def _finalists(first: Round, chosen: Named | None, sure: float) -> list[Ranked]:
+    whole = float(first.base.mean())
+    excess = max(whole - first.floor, 0.05 * whole, 1e-9)
     judged = [j for j, _, _ in first.judged]
-    chosen = next((n for n in named if n.round == 0), None)
     best = chosen.judged if chosen else max(judged, key=lambda j: j.mean)
     weight = {j.trial.id: math.exp(-SHARP * max(z, 0.0)) for j, z in rivals(judged, best)}
     p = {j.trial.id: (q, why) for j, q, why in first.judged}
     allowed = {k: w for k, w in weight.items() if not p[k][1] or (chosen is not None and k == best.trial.id)}
     total = sum(allowed.values()) or 1.0
-    sure = 0.0 if chosen is None else confidence(chosen, rounds[0].floor > 0.0)
-    rows = [
+    return [
         Ranked(
             id=j.trial.id,
             family=j.trial.family,
@@ -52,10 +87,6 @@ def ranking(rounds: Sequence[Round], named: Sequence[Named], unknown: bool) -> l
         )
         for j in judged
     ]
-    rows.sort(key=lambda r: (-r.probability, -r.gain))
-    none = 0.0 if chosen is not None else UNSEEN if unknown else 1.0 - UNSEEN
-    rest = max(0.0, 1.0 - sure - none)
-    return [*rows, Ranked("unknown", "unknown", rest, 0.0, 1.0, ""), Ranked("none", "none", none, 0.0, 1.0, "")]
 
 
 def _why(id: str, why: str, chosen: Named | None, best: str) -> str:

@@ -94,7 +94,7 @@ class Diagnosis:
             "sentence": self.sentence,
             "exploratory": self.exploratory,
             "causes": [_cause(c) for c in self.causes],
-            "group": [self.causes[0].id, *self.causes[0].group] if self.causes and self.causes[0].group else [],
+            "group": next(([c.id, *c.group] for c in self.causes if c.group), []),
             "ranking": [
                 {"id": r.id, "family": r.family, "probability": r.probability, "gain": r.gain,
                  "p_adjusted": r.p_adjusted, "rejected": r.rejected, "values": dict(r.values)}
@@ -105,7 +105,7 @@ class Diagnosis:
             "gain": {
                 "mean_mm": e.gain.mean, "low_mm": e.gain.low, "high_mm": e.gain.high,
                 "episodes_improved": f"{e.gain.improved}/{e.gain.episodes}",
-                "p_adjusted": min((c.p_adjusted for c in self.causes), default=1.0),
+                "p_adjusted": max((c.p_adjusted for c in self.causes), default=1.0),
             },
             "budget": dict(self.budget),
             "not_identifiable": list(self.not_identifiable),
@@ -140,5 +140,7 @@ def _errors(e: Errors) -> dict[str, Any]:
         "extended": e.extended.mean,
         "floor": e.floor,
         "split": e.split,
-        "episodes": {n: [float(a), float(b)] for n, a, b in zip(e.base.names, e.base.values, e.extended.values, strict=True)},
+        "episodes": {
+            n: [float(a), float(b)] for n, a, b in zip(e.base.names, e.base.values, e.extended.values, strict=True)
+        },
     }

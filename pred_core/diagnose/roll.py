@@ -19,7 +19,7 @@ from pred_core.springmass.arrays import mass_of_worlds
 from pred_core.springmass.parameters import added_by
 from pred_core.springmass.stability import demand
 from pred_core.twin import Twin
-from pred_core.types import Array, Grip, State
+from pred_core.types import Grip, State
 
 FARTHEST = 0.5  # [m] a coordinate's error counts with at most; also where the simulation is not finite
 NEAR = 0.01  # [m]
@@ -87,7 +87,8 @@ class Roller:
         result: Tensor | None = None
         memory: dict[int, Tensor] = {}  # episode -> (C, M + 1) what the laws remember, and steps
         for order in range(orders):
-            keep = np.flatnonzero(self.sample.order == order) if remembers else np.arange(self.sample.windows.count)
+            every = np.arange(self.sample.windows.count, dtype=np.int64)
+            keep = np.flatnonzero(self.sample.order == order).astype(np.int64) if remembers else every
             part, left = self._call(candidates, substeps, keep, memory)
             if result is None:
                 result = part.new_empty(part.shape[0], len(candidates), self.sample.windows.count, *part.shape[3:])
@@ -99,9 +100,9 @@ class Roller:
         return result
 
     def _call(
-        self, candidates: Sequence[Candidate], substeps: int, keep: Array, memory: dict[int, Tensor]
+        self, candidates: Sequence[Candidate], substeps: int, keep: NDArray[np.int64], memory: dict[int, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """One kernel call over some windows: errors (K, C, W', N, 3); effect memory and steps after it (C, W', M + 1)."""
+        """One kernel call over some windows: errors (K, C, W', N, 3), memory and steps after it (C, W', M + 1)."""
         w, count, twin = self.sample.windows, len(candidates), self.twin
         rows = torch.as_tensor(keep)
         width = len(rows)
@@ -116,7 +117,8 @@ class Roller:
             diverged_as_nan=True,
         )
         s, g = w.start, w.start_grip
-        state = State(*(_tile(v[rows], count) for v in (s.position, s.velocity, s.held)))
+        position, velocity, held = (_tile(v[rows], count) for v in (s.position, s.velocity, s.held))
+        state = State(position, velocity, held)
         grip = Grip(*(_tile(v[rows], count) for v in (g.position, g.rotation, g.closed)))
         state = simulator.start(state, grip)
         carried = dict(state.memory)

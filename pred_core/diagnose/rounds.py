@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -17,6 +19,7 @@ from pred_core.diagnose.roll import on_ground
 from pred_core.diagnose.search import Start
 from pred_core.diagnose.trial import NOT_A_NAME, make_trial
 from pred_core.effects import LIBRARY
+from pred_core.twin import Twin
 from pred_core.types import Array
 
 GATE_ONLY = ("gripper_offset", "gripper_rotation")  # absorbed by measured starts: the model-free gate names them
@@ -30,6 +33,7 @@ NOISE = 0.4  # loss of residuals that are noise: the mean of rho(u) for u ~ N(0,
 FEWEST = 10  # episodes for inference; fewer are exploratory
 EXPLORATORY = 0.5  # share of the excess a cause must close to be named from fewer
 CLOSE = 0.6  # share of the promise of its family's leader from which a candidate is kept beside it
+BETTER = 1.1  # times the gain of a simpler law that one with more parameters needs to be its rival
 PAIRED = 5  # candidates whose pairs are tried
 STANDING = 0.05  # of the floor: a gain below is not worth a name, whatever its significance
 
@@ -61,10 +65,24 @@ class Progress:
 
     bench: Bench
     journal: Journal
+    twins: list[Twin]  # before anything was named, and after each name
+    deadline: float = math.inf  # [s] of `time.monotonic`
     named: list[Named] = field(default_factory=list)
     rounds: list[Round] = field(default_factory=list)
     unknown: bool = False
     unknown_p: float = 1.0
+    notes: list[str] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)  # effect -> why it cannot be tried
+
+    def add(self, named: Named, bench: Bench) -> None:
+        """Take a name, and the bench that has it."""
+        self.named.append(named)
+        self.bench = bench
+        self.twins.append(bench.twin)
+
+    def late(self) -> bool:
+        """Whether the time is used up."""
+        return time.monotonic() > self.deadline
 
 
 def candidates(bench: Bench, named: Sequence[str]) -> list[Effects]:
@@ -121,7 +139,7 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
     excess = max(float(base.mean()) - floor, 0.0)
     found, rows = _choose(judged, excess, floor, progress, tell)
     closed = found.closed if found else 0.0
-    if found is None or closed < config.enough:
+    if (found is None or closed < config.enough) and not progress.late():
         pair = _pairs(progress, kept, judged, base, floor, tell, number)
         if pair is not None:
             found = pair
@@ -131,8 +149,7 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
     )
     if found is None:
         return False
-    progress.named.append(found)
-    progress.bench = extend(bench, found.judged)
+    progress.add(found, extend(bench, found.judged))
     return True
 
 
@@ -212,7 +229,7 @@ def _choose(
     judged: Sequence[Judged], excess: float, floor: float, progress: Progress, tell: Tell
 ) -> tuple[Named | None, list[tuple[Judged, float, str]]]:
     config = progress.bench.config
-    p = family_wise(judged, config.seed)
+    p = family_wise(judged, config.seed, progress.bench.target.roller.sample.groups)
     rows = [(j, float(q), _why_not(j, float(q), excess, floor, progress)) for j, q in zip(judged, p, strict=True)]
     rows.sort(key=lambda row: -row[0].mean)
     accepted = [row for row in rows if not row[2]]
@@ -221,9 +238,13 @@ def _choose(
     best = max(accepted, key=lambda row: row[0].mean)[0]
     chosen = simplest([row[0] for row in accepted], best)
     limit = set_limit(len(chosen.gain))
-    near = [o for o, z in rivals([r[0] for r in accepted], chosen) if o is not chosen and z < limit]
+    near = [
+        o
+        for o, z in rivals([r[0] for r in accepted], chosen)
+        if o is not chosen and z < limit and not (o.parameters > chosen.parameters and o.mean < BETTER * chosen.mean)
+    ]
     q = next(row[1] for row in accepted if row[0] is chosen)
-    closed = chosen.mean / excess if excess > 0 else 1.0
+    closed = share_closed(chosen, progress, excess, floor)
     return Named(chosen, q, tuple(o.trial.id for o in near), closed, len(progress.rounds)), rows
 
 
@@ -251,6 +272,24 @@ def _why_not(j: Judged, p: float, excess: float, floor: float, progress: Progres
     return ""
 
 
+def share_closed(j: Judged, progress: Progress, excess: float, floor: float) -> float:
+    """Share of the round's excess that is gone with it, 0 to 1."""
+    if excess <= 0.0:
+        return 0.0
+    standing = excess + floor
+    return float(np.clip((standing - float(j.extended.mean())) / excess, 0.0, 1.0))
+
+
+def _every_member(j: Judged) -> bool:
+    """Whether each effect of a pair has a switch whose interval leaves out its null."""
+    for id in j.trial.ids:
+        knobs = [j.trial.space.knobs[n].name for n in j.trial.amplitudes]
+        mine = [k for k in knobs if k.startswith(f"{id}.")]
+        if not any(j.intervals[k][0] > j.null[k] or j.intervals[k][1] < j.null[k] for k in mine):
+            return False
+    return True
+
+
 def _pairs(
     progress: Progress,
     kept: Sequence[Screened],
@@ -265,7 +304,7 @@ def _pairs(
     excess = float(base.mean()) - floor
     if bench.reference is None:  # without a floor nobody knows how much is enough
         return None
-    if excess < LEFT * floor or number + 2 > config.causes:
+    if excess < LEFT * floor or sum(len(n.judged.trial.ids) for n in progress.named) + 2 > config.causes:
         return None
     order = sorted(range(len(judged)), key=lambda n: -judged[n].mean)[:PAIRED]
     best: Judged | None = None
@@ -291,7 +330,8 @@ def _pairs(
             best = both
     if best is None or best.mean < max(config.enough * excess, alone + 0.15 * excess):
         return None
-    p = float(family_wise(tried, config.seed)[[t is best for t in tried].index(True)])
-    if p > config.level:
+    groups = bench.target.roller.sample.groups
+    p = float(family_wise(tried, config.seed, groups)[[t is best for t in tried].index(True)])
+    if _why_not(best, p, excess, floor, progress) or not _every_member(best):
         return None
-    return Named(best, p, (), best.mean / excess, number)
+    return Named(best, p, (), share_closed(best, progress, excess, floor), number)

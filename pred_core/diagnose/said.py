@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 NAMES = {
     "bending_by_angle": "resistance to bending by angle, instead of springs that skip particles",
     "rest_curvature": "a rest curvature that varies along the object",
-    "drag_linear": "air drag", "drag_quadratic": "quadratic air drag", "gravity_offset": "a different gravity direction",
+    "drag_linear": "air drag", "drag_quadratic": "quadratic air drag", "gravity_offset": "another gravity direction",
+    "length_drift": "length that drifts over the session", "length_scale": "another length",
+    "stretch_scale": "another axial stiffness", "strain_stiffening": "stiffening with stretch",
+    "bending_stiffening": "stiffening with bending",
     "bending_damping": "damping in bending", "bending_hysteresis": "dry friction inside the cable", "wind": "wind",
     "attraction": "a force towards a place", "tether": "a thread to a fixed point", "obstacle": "an obstacle",
     "friction_scale": "another friction coefficient", "friction_viscous": "viscous friction on the table",
@@ -24,7 +27,8 @@ NAMES = {
     "table_height": "another table height", "table_tilt": "a tilted table", "tip_mass": "mass at the tip",
     "mass_gradient": "mass that changes along the object", "bending_scale": "another bending stiffness",
     "bending_region": "a piece of other stiffness", "bending_gradient": "stiffness that changes along the object",
-    "friction_drift": "friction that drifts over the session", "stiffness_drift": "stiffness that drifts over the session",
+    "friction_drift": "friction that drifts over the session",
+    "stiffness_drift": "stiffness that drifts over the session",
     "bending_creep": "creep of the rest shape", "bending_plasticity": "plastic bending", "rest_bow": "a rest curvature",
     "grip_slip": "slip in the gripper", "delay": "a delay of the tracks", "camera_scale": "a scale error of the camera",
     "camera_rotation": "a rotation of the camera", "camera_translation": "a shift of the camera",
@@ -36,29 +40,36 @@ STILL = 0.01  # [m] of gripper travel in an episode below which nothing is excit
 def called(cause: Cause) -> str:
     """A cause in words with its main number."""
     words = NAMES.get(cause.id, cause.id.replace("_", " "))
-    first = next(iter(cause.parameters.items()), None)
-    if first is None:
+    if not cause.parameters:
         return words
-    _, v = first
-    return f"{words}: {v.value:.3g} {v.unit} [{v.low:.3g}, {v.high:.3g}]"
+    name = next(iter(cause.parameters)).split("[")[0]
+    values = [v for k, v in cause.parameters.items() if k.split("[")[0] == name]
+    unit = "" if values[0].unit == "1" else f" {values[0].unit}"
+    if len(values) == 1:
+        v = values[0]
+        return f"{words}: {v.value:.3g}{unit} [{v.low:.3g}, {v.high:.3g}]"
+    if len(values) > 3:  # a profile
+        return words
+    return f"{words}: ({', '.join(f'{v.value:.3g}' for v in values)}){unit}"
 
 
 def sentence(d: Diagnosis) -> str:
     """The sentence a report opens with."""
     e = d.errors
+    held = "held-out error" if e.split == "test" else "error on the episodes it was fitted to"
     numbers = (
-        f"the held-out error falls from {e.base.mean:.1f} to {e.extended.mean:.1f} mm, "
+        f"the {held} falls from {e.base.mean:.1f} to {e.extended.mean:.1f} mm, "
         f"{e.gain.improved} of {e.gain.episodes} episodes"
     )
     label = "Exploratory, too few episodes for a firm answer: " if d.exploratory else ""
     if d.outcome == "none":
-        return f"{label}Nothing is found that your simulation lacks: its held-out error is {e.base.mean:.1f} mm."
+        return f"{label}Nothing is found that your simulation lacks: its {held} is {e.base.mean:.1f} mm."
     if d.outcome == "unknown":
         near = ", ".join(NAMES.get(c.id, c.id) for c in d.causes)
         partly = f" ({near} explains a part)" if near else ""
         return f"{label}Your simulation lacks something that no candidate explains{partly}; {numbers}."
     what = "; and ".join(called(c) for c in d.causes)
-    group = d.causes[0].group
+    group = tuple(g for c in d.causes for g in c.group)
     unsure = f" (or {', '.join(NAMES.get(g, g) for g in group)}: these data do not tell)" if group else ""
     return f"{label}Your simulation lacks {what}{unsure}; with it {numbers}."
 

@@ -49,7 +49,8 @@ class Sample:
         """Indices of the windows of some episodes, in the order `part` has them."""
         place = {e: n for n, e in enumerate(episodes)}
         keep = np.flatnonzero(np.isin(self.episode, list(episodes)))
-        return np.asarray(keep[np.lexsort(([place[e] for e in self.episode[keep].tolist()], self.order[keep]))])
+        places = np.array([place[e] for e in self.episode[keep].tolist()])
+        return np.asarray(keep[np.lexsort((places, self.order[keep]))])
 
     def part(self, episodes: Sequence[int]) -> Sample:
         """Only some episodes, in the given order."""
@@ -129,8 +130,9 @@ def _starts(recording: Recording, steps: int, pieces: int) -> list[int]:
     starts = []
     for piece in range(pieces):
         wanted = 1 + piece * steps
-        found = [f for f in range(wanted, min(wanted + LATE * (1 if piece else 8), last)) if bool(usable[f])]
-        if found and found[0] + steps // 2 <= last:
+        reach = min(wanted + LATE, last) if piece else last
+        found = [f for f in range(wanted, reach) if bool(usable[f])]
+        if found and (piece == 0 or found[0] + steps // 2 <= last):
             starts.append(found[0])
         elif piece == 0:
             return []

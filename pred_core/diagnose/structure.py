@@ -72,9 +72,8 @@ def question(bench: Bench, journal: Journal, tell: Tell) -> tuple[Bench, Judged,
     twin = with_stored(slim, stored["twin"])
     base = _losses(before, target)
     extended = _losses(twin, target)
-    train = bench.train
     for group, values in stored["without"]:
-        mine = train & (target.roller.sample.groups == group)
+        mine = target.roller.sample.groups == group
         if mine.any():
             extended[mine] = _losses(with_stored(slim, values), target)[mine]
     trial = _trial(twin)

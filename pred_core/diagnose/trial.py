@@ -45,7 +45,8 @@ def make_trial(twin: Twin, effects: tuple[type[Effect], ...], physics: tuple[str
         parameter = _parameter(effect, knob.name)
         if parameter is switch(effect):
             amplitudes.append(n)
-    return Trial(ids, "+".join(dict.fromkeys(e.family for e in effects)), space, tuple(amplitudes), bool(standing & set(ids)))
+    family = "+".join(dict.fromkeys(e.family for e in effects))
+    return Trial(ids, family, space, tuple(amplitudes), bool(standing & set(ids)))
 
 
 def switch(effect: type[Effect]) -> Parameter:
@@ -63,7 +64,9 @@ def _parameter(effect: type[Effect], knob: str) -> Parameter:
     return next(q for q in effect.parameters if q.name == name)
 
 
-def first_values(effect: type[Effect], roller: Roller, error: Array, count: int, rng: np.random.Generator) -> list[Extension]:
+def first_values(
+    effect: type[Effect], roller: Roller, error: Array, count: int, rng: np.random.Generator
+) -> list[Extension]:
     """Extensions with the switch at its null and the scanned parameters drawn; one, if nothing is scanned.
 
     `error` (W, K, N): size of the residual. Places are drawn where the residual is large, between what was predicted

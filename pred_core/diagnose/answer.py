@@ -1,0 +1,157 @@
+"""From what a diagnosis found to what it says: causes, errors in millimetres, budget, twin."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pred_core.diagnose.causes import causes_of, evidence_of
+from pred_core.diagnose.errors import EpisodeErrors, episode_errors, gain_of
+from pred_core.diagnose.gate import GateResult
+from pred_core.diagnose.judge import Bench, Tell
+from pred_core.diagnose.next_motion import propose
+from pred_core.diagnose.ranking import ranking
+from pred_core.diagnose.result import Cause, Diagnosis, Errors
+from pred_core.diagnose.roll import Roller
+from pred_core.diagnose.rounds import FEWEST, Progress
+from pred_core.diagnose.said import not_identifiable, sentence
+from pred_core.twin import Twin
+from pred_core.types import Episode
+
+
+@dataclass(frozen=True)
+class Study:
+    """What a diagnosis began with."""
+
+    raw: tuple[Episode, ...]
+    corrected: tuple[Episode, ...]  # by what the gate found
+    known: tuple[Episode, ...]  # the reference's, as its twin's calibration sees them; () without one
+    given: Twin
+    gate: GateResult
+    bench: Bench  # before anything was named
+    session: int  # [ns] its beginning
+
+
+def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagnosis:
+    """The whole answer; replays whole held-out episodes."""
+    config = study.bench.config
+    ranked = ranking(study.gate, progress)
+    causes = causes_of(study.gate, progress, {r.id: r.probability for r in ranked})
+    split = "test" if any(e.split == "test" for e in study.corrected) else "train"
+    tell(f"errors on the {split} episodes")
+    errors = _errors(study, progress, split)
+    ood = _errors(study, progress, "ood") if any(e.split == "ood" for e in study.corrected) else None
+    few = len([e for e in study.corrected if e.split != "ood"]) < FEWEST
+    result = Diagnosis(
+        outcome=_outcome(causes, progress),
+        sentence="",
+        causes=causes,
+        ranking=tuple(ranked),
+        errors=errors,
+        errors_ood=ood,
+        budget=_budget(study, progress, errors),
+        not_identifiable=tuple(not_identifiable(progress, study.corrected)),
+        not_testable=_not_testable(study.gate, progress),
+        next_motion=None,
+        exploratory=few,
+        notes=_notes(study, progress, errors, ood),
+        gate=study.gate,
+        rounds=tuple(progress.rounds),
+        base_twin=study.bench.twin,
+        twin=_twin(study, progress, causes),
+        seconds=0.0,
+        seed=config.seed,
+    )
+    result = dataclasses.replace(result, next_motion=propose(result, study.corrected, config.seed))
+    return dataclasses.replace(result, sentence=sentence(result), seconds=time.monotonic() - begin)
+
+
+def _outcome(causes: Sequence[Cause], progress: Progress) -> str:
+    physics = [c for c in causes if not c.measured]
+    if progress.unknown and max((c.closed for c in physics), default=0.0) < progress.bench.config.enough:
+        return "unknown"
+    if not causes:
+        return "none"
+    return "group" if any(c.group for c in causes) else "named"
+
+
+def _twin(study: Study, progress: Progress, causes: Sequence[Cause]) -> Twin:
+    """What was named, in the twin; with the substeps it needs, and beside it the base it was compared with."""
+    final, given, first = progress.bench.twin, study.given, study.bench.twin
+    needed = math.ceil(Roller(final, progress.bench.target.roller.sample).usual())
+    substeps = None if given.meta.substeps is None else max(given.meta.substeps, needed)
+    found = ", ".join(c.id for c in causes) or "nothing"
+    notes = [*given.meta.notes, f"diagnosed: {found}"]
+    if given.residual is not None:
+        notes.append("the network of the twin that was questioned is not in this one: train it anew")
+    if any(c.family == "drift" for c in causes):
+        notes.append("what drifts begins anew with every start in a node: identify it again for another session")
+    changed = [f.name for f in dataclasses.fields(final.physics)
+               if getattr(final.physics, f.name) != getattr(given.physics, f.name)]  # fmt: skip
+    return final.replace(
+        meta=dataclasses.replace(given.meta, parent=given.digest(), substeps=substeps, notes=tuple(notes)),
+        extensions=tuple(evidence_of(e, progress) for e in final.extensions),
+        physics_report={k: v for k, v in given.physics_report.items() if k not in changed},
+        calibration=study.gate.calibration,
+        residual=None,
+        base=first.replace(calibration=given.calibration, residual=None, base=None),
+    )
+
+
+def _errors(study: Study, progress: Progress, split: str) -> Errors:
+    """Base: data as the given twin's own calibration sees it; extended: with what the gate found corrected."""
+    before = episode_errors(study.bench.twin, _before(study, split), study.session)
+    after = episode_errors(progress.bench.twin, _after(study, split), study.session)
+    same = [e for e in study.known if e.split == split]
+    floor = episode_errors(study.bench.reference_twin, same).mean if same else None
+    return Errors(split, before, after, floor, gain_of(before, after, study.bench.config.seed))
+
+
+def _before(study: Study, split: str) -> list[Episode]:
+    return [study.given.calibration.correct(e) for e in study.raw if e.split == split]
+
+
+def _after(study: Study, split: str) -> list[Episode]:
+    return [e for e in study.corrected if e.split == split]
+
+
+def _budget(study: Study, progress: Progress, errors: Errors) -> dict[str, Any]:
+    """The held-out error [mm] stage by stage: what each cause takes away in the order they were named, and what is
+    left. What correcting the data takes away is shared among sensor causes by their size at the object.
+    """
+    episodes = _after(study, errors.split)
+    stages: list[EpisodeErrors] = [episode_errors(t, episodes, study.session) for t in progress.twins]
+    named: dict[str, float] = {}
+    sensors = [c for c in study.gate.accepted if c.id in study.gate.sensor_ids]
+    size = sum(c.effect_mm for c in sensors) or 1.0
+    for c in sensors:
+        named[c.id] = (errors.base.mean - stages[0].mean) * c.effect_mm / size
+    for n, (one, other) in zip(progress.named, zip(stages[:-1], stages[1:], strict=True), strict=True):
+        named[n.judged.trial.id] = one.mean - other.mean
+    floor = min(errors.floor or 0.0, errors.extended.mean)
+    return {"named": named, "learned": 0.0, "unexplained": errors.extended.mean - floor, "floor": floor}
+
+
+def _not_testable(gate: GateResult, progress: Progress) -> Mapping[str, str]:
+    rows = {c.id: c.why for c in gate.causes if not c.testable}
+    for judged, _, why in (row for r in progress.rounds for row in r.judged):
+        if why.startswith("acts in"):
+            rows[judged.trial.id] = f"these motions hardly excite it: it {why}"
+    return {**rows, **progress.skipped}
+
+
+def _notes(study: Study, progress: Progress, errors: Errors, ood: Errors | None) -> tuple[str, ...]:
+    rows = [*study.gate.notes, *progress.notes]
+    for e in (errors, ood):
+        for title, side in () if e is None else (("base", e.base), ("extended", e.extended)):
+            if side.diverged:
+                rows.append(f"{title}: the simulation diverged in {', '.join(side.diverged)}; counted as 0.5 m")
+    if study.bench.reference is None:
+        rows.append("no reference: what the engine and the object lack in common may carry a cause's name")
+    if study.given.residual is not None:
+        rows.append("the twin's network was left out: the base is its simulation alone")
+    return tuple(rows)

@@ -1,0 +1,85 @@
+"""The causes that were found, with their parameters, and the evidence a twin carries of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+from pred_core.diagnose.gate import GateCause, GateResult
+from pred_core.diagnose.result import Cause, Value
+from pred_core.diagnose.rounds import Named, Progress
+from pred_core.diagnose.structure import FAMILY, ID
+from pred_core.effects import LIBRARY, find_effect
+from pred_core.twin import Extension
+
+
+def causes_of(gate: GateResult, progress: Progress, probability: Mapping[str, float]) -> tuple[Cause, ...]:
+    """Sensor causes first, then physics in the order it was named."""
+    rows = [
+        Cause(c.id, family_of(c.id), probability[c.id], _gate_values(c), True, 1.0, c.p_adjusted, c.confused_with)
+        for c in gate.accepted
+        if c.id in gate.sensor_ids
+    ]
+    for n in progress.named:
+        rows += _named(n, probability)
+    names = {c.id for c in rows}
+    return tuple(dataclasses.replace(c, group=tuple(g for g in c.group if g not in names)) for c in rows)
+
+
+def family_of(id: str) -> str:
+    """Family of any cause."""
+    if id == ID:
+        return FAMILY
+    return LIBRARY[id].family if id in LIBRARY else "camera"
+
+
+def _named(n: Named, probability: Mapping[str, float]) -> list[Cause]:
+    j = n.judged
+    sure = probability[j.trial.id]
+    if j.trial.ids == (ID,):
+        knob = j.trial.space.knobs[0]
+        value = Value(j.values[knob.name], knob.unit, *j.intervals[knob.name])
+        return [Cause(ID, FAMILY, sure, {knob.name: value}, False, n.closed, n.p_adjusted)]
+    rows = []
+    for id in j.trial.ids:
+        effect = find_effect(id)
+        values = {}
+        for knob in j.trial.space.knobs:
+            if not knob.name.startswith(f"{id}."):
+                continue
+            name = knob.name.split(".", 1)[1]
+            plain = name.split("[")[0]
+            size = next(q.size for q in effect.parameters if q.name == plain)
+            low, high = j.intervals[knob.name]
+            values[name if size > 1 else plain] = Value(
+                j.values[knob.name], knob.unit, low, high, j.at_bound[knob.name]
+            )
+        rows.append(Cause(id, effect.family, sure, values, False, n.closed, n.p_adjusted, n.group))
+    return rows
+
+
+def _gate_values(cause: GateCause) -> dict[str, Value]:
+    rows: dict[str, Value] = {}
+    for name, values in cause.parameters.items():
+        spans: Sequence[tuple[float, float]] = cause.interval.get(name, ())
+        for k, value in enumerate(values):
+            low, high = spans[k] if k < len(spans) else (value, value)
+            rows[name if len(values) == 1 else f"{name}[{k}]"] = Value(value, cause.unit, low, high)
+    return rows
+
+
+def evidence_of(extension: Extension, progress: Progress) -> Extension:
+    """The extension with how it was found."""
+    for n in progress.named:
+        if extension.id in n.judged.trial.ids:
+            better, acting = n.judged.improved
+            evidence = {
+                "found_by": "pred diagnose",
+                "p_adjusted": n.p_adjusted,
+                "closed": n.closed,
+                "episodes_improved": f"{better}/{acting}",
+                "interval": {k: list(v) for k, v in n.judged.intervals.items() if k.startswith(f"{extension.id}.")},
+                "group": list(n.group),
+            }
+            return dataclasses.replace(extension, evidence=evidence)
+    return extension
