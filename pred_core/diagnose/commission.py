@@ -18,7 +18,7 @@ from pred_core.diagnose.sample import Sample, make_sample
 from pred_core.diagnose.trial import make_trial
 from pred_core.diagnose.weigh import misfit_of, seen_of, weigh
 from pred_core.effects import find_effect
-from pred_core.errors import DatasetError
+from pred_core.errors import ConfigError, DatasetError
 from pred_core.identify.space import Candidate
 from pred_core.twin import Extension, Twin
 from pred_core.types import Episode, Physics
@@ -56,6 +56,12 @@ def commission(
     sample = make_sample(suspect, twin, config.window, session)
     known = make_sample(reference, twin, config.window) if reference else None
     judged_on = known or sample
+    frames = len(sample.windows.target)
+    if config.stride > frames:
+        raise ConfigError(
+            "stride", got=f"{config.stride} frames", allowed=f"at most {frames}, the length of a window",
+            next_step="Give a smaller --stride or a longer --window",
+        )  # fmt: skip
     use = np.array([s == "train" for s in judged_on.splits])
     if not use.any():  # a reference of test episodes alone
         use[:] = True
@@ -75,7 +81,7 @@ def commission(
         other = Target(roller, weigh(roller, as_it_is, config.stride, misfit, config.seed), config.stride)
     physics = () if known is not None else base_fields(twin)
     train = np.flatnonzero(np.array([s == "train" for s in sample.splits]))
-    return Bench(twin, target, target.part(train.tolist()), twin, other, config, physics)
+    return Bench(twin, target, target.part(train.tolist()), twin, other, config, (), physics)
 
 
 def with_values(twin: Twin, candidate: Candidate) -> Twin:

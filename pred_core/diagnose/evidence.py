@@ -13,6 +13,7 @@ from pred_core.diagnose.trial import Trial
 from pred_core.types import Array
 
 FLIPS = 20_000
+TIE = 1e-9  # relative: the unflipped draw must count, whatever its rounding
 FEWEST_GROUPS = 6  # 2^-6 is the smallest p value they can show
 ACTS = 0.1  # standard deviations of a residual by which a cause must move an episode to count as acting in it
 NESTED = 0.97  # of the best gain: with fewer parameters, so little less is the better name
@@ -86,7 +87,7 @@ def family_wise(judged: Sequence[Judged], seed: int, groups: NDArray[np.int64] |
         variance = (scale**2 / count - means**2) * count / (count - 1)
         flipped = np.where(variance > 0, means / np.sqrt(variance / count), 0.0)
     largest = flipped.max(axis=1)
-    return np.asarray((1 + (largest[None] >= observed[:, None]).sum(axis=1)) / (1 + FLIPS))
+    return np.asarray((1 + (largest[None] >= (observed - TIE * np.abs(observed))[:, None]).sum(axis=1)) / (1 + FLIPS))
 
 
 def _studentized(gains: Array) -> Array:

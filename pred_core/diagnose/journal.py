@@ -25,7 +25,10 @@ class Journal:
             return
         line = json.dumps({"header": header}, sort_keys=True)
         path.parent.mkdir(parents=True, exist_ok=True)
-        text = path.read_text(encoding="utf-8") if path.is_file() else ""
+        try:
+            text = path.read_text(encoding="utf-8") if path.is_file() else ""
+        except UnicodeDecodeError as error:
+            raise ConfigError(f"{path}: is damaged", got=error, next_step="Delete it to begin anew") from error
         whole = text[: text.rfind("\n") + 1]
         rows = whole.splitlines()
         if rows and rows[0] == line:

@@ -36,6 +36,7 @@ class Bench:
     reference_twin: Twin
     reference: Target | None
     config: DiagnoseConfig
+    free: tuple[str, ...] = ()  # effects that were named: refitted with every further candidate
     physics: tuple[str, ...] = ()  # base parameters that every candidate refits: without a reference, all of them
 
     @property
@@ -45,7 +46,7 @@ class Bench:
 
     def trial(self, effects: Effects) -> Trial:
         """A candidate on the suspect set."""
-        return make_trial(self.twin, effects, self.physics)
+        return make_trial(self.twin, effects, self.physics, self.free)
 
     def standing(self) -> Array:
         """(E,) losses of the suspect set as the twin is."""
@@ -125,7 +126,7 @@ def null_of(bench: Bench, screened: Screened, found: Array) -> Array:
 def _back_fit(bench: Bench, screened: Screened, found: Array) -> Array:
     """The base alone, refined from where it stands and from where the candidate led it: a candidate must not gain by
     getting the base out of a local optimum."""
-    base = make_trial(bench.twin, (), bench.physics)
+    base = make_trial(bench.twin, (), bench.physics, bench.free)
     begins = (base.space.start(), _like(screened.trial, base, found))
     ends = [fit(bench.fitted, base.space, z, bench.config.iterations) for z in begins]
     best = min(ends, key=lambda f: float(f.loss.mean()))

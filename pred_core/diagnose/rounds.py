@@ -31,6 +31,7 @@ BEHIND = 0.35  # share of the leader's gain below which the others are not
 UNEXPLAINED = 3.0  # times the loss of noise: without a reference, what is left is then worth saying
 NOISE = 0.4  # loss of residuals that are noise: the mean of rho(u) for u ~ N(0, 1) is 0.36
 FEWEST = 10  # episodes for inference; fewer are exploratory
+SLIGHT = 0.05  # of the mean gain: an episode that loses less is not worse
 EXPLORATORY = 0.5  # share of the excess a cause must close to be named from fewer
 CLOSE = 0.6  # share of the promise of its family's leader from which a candidate is kept beside it
 BETTER = 1.1  # times the gain of a simpler law that one with more parameters needs to be its rival
@@ -76,6 +77,7 @@ class Progress:
 
     def add(self, named: Named, bench: Bench) -> None:
         """Take a name, and the bench that has it."""
+        self.named = [_refitted(n, named.judged) for n in self.named]
         self.named.append(named)
         self.bench = bench
         self.twins.append(bench.twin)
@@ -83,6 +85,18 @@ class Progress:
     def late(self) -> bool:
         """Whether the time is used up."""
         return time.monotonic() > self.deadline
+
+
+def _refitted(named: Named, later: Judged) -> Named:
+    """An earlier name with the values it has beside a later one: they were fitted together."""
+    j = named.judged
+    mine = set(j.values) & set(later.values)
+    judged = dataclasses.replace(
+        j,
+        values={**j.values, **{k: later.values[k] for k in mine}},
+        intervals={**j.intervals, **{k: later.intervals[k] for k in mine}},
+    )
+    return dataclasses.replace(named, judged=judged)
 
 
 def candidates(bench: Bench, named: Sequence[str]) -> list[Effects]:
@@ -187,7 +201,8 @@ def extend(bench: Bench, judged: Judged) -> Bench:
     changed = {e.id: e for e in space.candidate(null).extensions if e.id in judged.trial.ids}
     kept = tuple(changed.pop(e.id, e) for e in bench.reference_twin.extensions) + tuple(changed.values())
     reference = bench.reference_twin.replace(extensions=kept)
-    return dataclasses.replace(bench, twin=twin, reference_twin=reference)
+    free = (*bench.free, *judged.trial.ids)
+    return dataclasses.replace(bench, twin=twin, reference_twin=reference, free=free)
 
 
 def _reference_losses(bench: Bench) -> Array:
@@ -256,8 +271,9 @@ def _why_not(j: Judged, p: float, excess: float, floor: float, progress: Progres
     least = max((config.cold_gate if cold else config.gate) * whole, STANDING * floor)
     better, acting = j.improved
     if len(j.gain) < FEWEST:  # no inference from so few: what helps everywhere, and much, is named as exploratory
-        if acting == 0 or better < acting:
-            return f"{better} of {acting} episodes improve"
+        worse = int((j.gain[j.acts] < -SLIGHT * j.mean).sum())
+        if acting == 0 or worse:
+            return f"{worse} of {acting} episodes get worse"
         return "" if j.mean >= max(EXPLORATORY * whole, least) else f"saves too little ({j.mean:.3f} of the loss)"
     if acting < 4:
         return f"acts in {acting} episodes only"

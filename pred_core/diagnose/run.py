@@ -47,6 +47,7 @@ def diagnose(
     session = min(int(e.stamps[0]) for e in corrected)
     journal = journal or Journal(None, {})
     fitted = [e for e in corrected if e.split != "ood"]
+    _check_ids(fitted, known, plain)
     bench = commission(plain, fitted, known, config, tell, journal, session)
     progress = Progress(bench, journal, [bench.twin], deadline=begin + LATEST * config.seconds)
     if bench.reference is None and applies(bench.twin):
@@ -90,6 +91,19 @@ def _check(
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise DatasetError("two bags have one name", got=", ".join(twice[:3]), next_step="Rename one of them")
+
+
+def _check_ids(suspect: Sequence[Episode], known: Sequence[Episode], twin: Twin) -> None:
+    """Raise DatasetError if something is tracked that the twin does not have."""
+    have = {int(i) for i in twin.body.id}
+    for episode in (*suspect, *known):
+        more = [int(i) for i in episode.tracks.id if int(i) not in have]
+        if more:
+            raise DatasetError(
+                f"{episode.name}: tracks have particles that the twin lacks",
+                got=f"id {', '.join(map(str, more[:5]))}",
+                next_step="Identify a twin from this data set or its reference",
+            )
 
 
 def _change_structure(progress: Progress, tell: Tell) -> None:

@@ -32,11 +32,13 @@ class Trial:
         return "+".join(self.ids)
 
 
-def make_trial(twin: Twin, effects: tuple[type[Effect], ...], physics: tuple[str, ...] = ()) -> Trial:
-    """A trial of these effects; `physics`: base parameters that are refitted with it."""
+def make_trial(
+    twin: Twin, effects: tuple[type[Effect], ...], physics: tuple[str, ...] = (), free: tuple[str, ...] = ()
+) -> Trial:
+    """A trial of these effects. `physics`: base parameters, `free`: effects of the twin, that are refitted with it."""
     ids = tuple(e.id for e in effects)
     standing = {e.id for e in twin.extensions}
-    space = search_space(twin.physics, physics, ids, twin.extensions)
+    space = search_space(twin.physics, physics, (*ids, *(f for f in free if f not in ids)), twin.extensions)
     amplitudes = []
     for n, knob in enumerate(space.knobs):
         effect = next((e for e in effects if knob.name.startswith(f"{e.id}.")), None)
