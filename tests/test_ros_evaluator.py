@@ -32,9 +32,12 @@ from pred_ros import bringup, convert, qos, shell
 from pred_ros.arm_node import ArmNode
 from pred_ros.evaluator_node import EvaluatorNode
 from pred_ros.live_report import stage_name
+from pred_ros.planner_node import PlannerNode
+from pred_ros.plant_node import PlantNode
 from pred_ros.player_node import PlayerNode
 from pred_ros.predictor_node import PredictorNode
 from pred_ros.processes import Children
+from pred_ros.tracker_node import TrackerNode
 
 ROOT = Path(__file__).parents[1]
 ERROR = DiagnosticStatus.ERROR
@@ -224,11 +227,13 @@ def test_descriptors_carry_unit_and_range(bench: Bench) -> None:
 
 @pytest.mark.parametrize("file", sorted((ROOT / "config" / "nodes").glob("*.yaml")), ids=lambda p: p.name)
 def test_shipped_parameter_files_fit_the_nodes(file: Path) -> None:
-    classes = {c.NAME: c.CONFIG for c in (PlayerNode, PredictorNode, EvaluatorNode, ArmNode)}
+    nodes = (PlayerNode, PredictorNode, EvaluatorNode, ArmNode, TrackerNode, PlannerNode, PlantNode)
+    classes = {c.NAME: c.CONFIG for c in nodes}
     from pred_core.config import from_mapping
 
     for name, parameters in bringup.read_nodes(file).items():
-        from_mapping(classes[name], parameters, f"{file.name}: {name}")
+        own = {k: v for k, v in parameters.items() if k != "use_sim_time"}  # which every ROS node has
+        from_mapping(classes[name], own, f"{file.name}: {name}")
     assert load_yaml(file)
 
 
