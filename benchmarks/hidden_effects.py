@@ -12,6 +12,8 @@
         six laws that nothing obeys among the candidates; answers in WORK/out_placebos
     ... --set dev
         the development cases, on which everything was chosen; other seeds, other folder
+    ... --set seen
+        cases that an earlier version of the engine answered and that were looked at: development cases as well
 
 A case's data stand in WORK/<name>, its truth beside it, its diagnosis in WORK/out/<name>. Everything is kept that is
 there already.
@@ -35,7 +37,7 @@ from pathlib import Path
 from typing import Any
 
 from hidden_bench import pieces
-from hidden_cases import Case, Release, release, simulate
+from hidden_cases import SETS, Case, Release, release, simulate
 from hidden_scores import Judgement, judged
 from hidden_table import compare, markdown, scores
 
@@ -80,7 +82,7 @@ def _arguments() -> argparse.Namespace:
         command.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these cases")
         command.add_argument("--work", type=Path, required=True, metavar="DIR", help="where everything stands")
         command.add_argument("--out", default="", help="folder of the answers in the work folder (out)")
-        command.add_argument("--set", choices=("final", "dev"), default="final", help="which cases")
+        command.add_argument("--set", choices=SETS, default="final", help="which cases")
     args = parser.parse_args()
     args.out = args.out or ("out_placebos" if getattr(args, "placebos", False) else "out")
     return args
