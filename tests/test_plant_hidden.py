@@ -123,6 +123,22 @@ def test_drags_slow_a_free_rope_down_by_their_law() -> None:
         assert speed == pytest.approx(expected, rel=0.01), name
 
 
+def test_viscous_friction_stops_a_link_at_most() -> None:
+    """1 m/s along the table. A load of 1e-4 N and c = 2 s/m: 2e-4 N back. A blow of 50 N: m / step, which stops the
+    link within a step of 1/300 s, and not 100 N, which would send a link of 1.6 g back at 200 m/s.
+    """
+    free = free_rope()
+    free.data.qvel[:] = 0.0
+    free.data.qvel[0] = 1.0
+    mujoco.mj_forward(free.model, free.data)
+    effect = make_effect("friction_viscous", 2.0, 0)
+    for load, expected in ((1e-4, np.full(32, -2e-4)), (50.0, -free.mass / free.model.opt.timestep)):
+        free.load[:] = load
+        free.data.xfrc_applied[:] = 0.0
+        effect.act(free)
+        assert free.data.xfrc_applied[free.links, 0] == pytest.approx(expected, rel=1e-6)
+
+
 def test_the_swirl_turns_motion_and_does_no_work() -> None:
     """w t = 2 /s x 0.5 s = 1 rad to the left; explicit steps gain (w h)^2 / 2 a step: 0.3 % here."""
     after = force_on_free_rope(make_effect("swirl", 2.0, 0), (1.0, 0.0, 0.0), 0.5)

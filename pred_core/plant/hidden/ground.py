@@ -78,15 +78,20 @@ class StickyPatch(LinkFriction):
 
 
 class ViscousFriction(HiddenEffect):
-    """A drag of links that press on the table, in proportion to load and sliding speed."""
+    """A drag of links that press on the table, in proportion to load and sliding speed.
+
+    The load is that of the last step, and a blow on the table is many times the weight: no more than stops a link
+    within the step, or the explicit force would throw it back faster than it came.
+    """
 
     needs_load = True
 
     def act(self, world: World) -> None:
-        """Force -c N v along the table."""
+        """Force -min(c N, m / step) v along the table."""
         v = world.velocity
         v[:, 2] = 0.0
-        world.add_force(-self.magnitude * world.load[:, None] * v)
+        most = world.mass / world.model.opt.timestep
+        world.add_force(-np.minimum(self.magnitude * world.load, most)[:, None] * v)
 
 
 class TableHeight(HiddenEffect):
