@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import mujoco
 import numpy as np
 
@@ -15,7 +17,7 @@ SHAKE_FREQUENCY = 6.0  # [Hz]
 SHAKE_ARMATURE, SHAKE_BANDWIDTH = 1e4, 200.0  # [kg], [rad/s]
 
 
-class LinkFriction(HiddenEffect):
+class LinkFriction(HiddenEffect, ABC):
     """Base of effects that give every link its own Coulomb coefficient, anew at every step."""
 
     def begin(self, world: World) -> None:
@@ -30,9 +32,9 @@ class LinkFriction(HiddenEffect):
         """Set the coefficients; MuJoCo reads them at the next step."""
         world.model.geom_friction[world.geoms, 0] = np.maximum(self._usual * (1.0 + self.change(world)), 1e-5)
 
+    @abstractmethod
     def change(self, world: World) -> Array:
         """Relative change (L,) of the coefficient."""
-        raise NotImplementedError
 
 
 class FrictionScale(LinkFriction):

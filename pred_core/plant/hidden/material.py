@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 
 from pred_core.plant.hidden.effect import Array, Entry, HiddenEffect
@@ -47,7 +49,7 @@ class StiffnessDrift(HiddenEffect):
         world.model.jnt_stiffness[world.joints] = self._usual * (1.0 + self.magnitude * minutes)
 
 
-class Mass(HiddenEffect):
+class Mass(HiddenEffect, ABC):
     """Base: masses and inertias of the links, each by its own factor, before the model is compiled."""
 
     def build(self, rope: RopeModel) -> None:
@@ -56,9 +58,9 @@ class Mass(HiddenEffect):
             for geom in link.geoms:
                 geom.mass = geom.mass * float(factor)
 
+    @abstractmethod
     def where(self, material: Array) -> Array:
         """Weight (L,) of the change."""
-        raise NotImplementedError
 
 
 class HeavyTip(Mass):
