@@ -8,6 +8,8 @@
         the base's error on the same motions with nothing hidden: how strong an effect is; `score` bins by it
     ... oracle --work out/hidden          ... baselines --work out/hidden
         what could be avoided at most, and what simpler ways would have answered: `score` then shows them too
+    ... ablate --work out/hidden
+        the diagnoses again, each without one step (answers in WORK/out_no_<step>): `score` then compares them
     ... run --placebos    ... score --placebos
         six laws that nothing obeys among the candidates; answers in WORK/out_placebos
     ... --set dev
@@ -39,10 +41,11 @@ from typing import Any
 from hidden_bench import pieces
 from hidden_cases import SETS, Case, Release, release, simulate
 from hidden_scores import Judgement, judged
-from hidden_table import compare, markdown, scores
+from hidden_table import ablated, compare, markdown, scores
 
 import pred_core
 from pred_core.cli.main import BAD_INPUT
+from pred_core.diagnose.config import STEPS
 from pred_core.errors import PredError
 from pred_core.plant.case import truth_path
 
@@ -66,6 +69,8 @@ def _arguments() -> argparse.Namespace:
     run = commands.add_parser("run", help="simulate, identify and diagnose")
     run.set_defaults(act=run_cases)
     run.add_argument("--flags", default="", help="more flags for pred diagnose, in one string")
+    less = commands.add_parser("ablate", help="diagnose again, each time without one step")
+    less.set_defaults(act=run_ablations)
     score = commands.add_parser("score", help="score the diagnoses that are there")
     score.set_defaults(act=score_cases)
     least = commands.add_parser("oracle", help="fit the true law of every case that has one")
@@ -74,11 +79,11 @@ def _arguments() -> argparse.Namespace:
     simple.set_defaults(act=run_baselines)
     plain = commands.add_parser("paired", help="errors of the base on the same motions with nothing hidden")
     plain.set_defaults(act=run_paired)
-    for command in (run, least, simple, plain):
+    for command in (run, less, least, simple, plain):
         command.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at once")
     for command in (run, score):
         command.add_argument("--placebos", action="store_true", help="with laws that nothing obeys")
-    for command in (run, score, least, simple, plain):
+    for command in (run, less, score, least, simple, plain):
         command.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these cases")
         command.add_argument("--work", type=Path, required=True, metavar="DIR", help="where everything stands")
         command.add_argument("--out", default="", help="folder of the answers in the work folder (out)")
@@ -111,6 +116,23 @@ def run_cases(args: argparse.Namespace) -> int:
     ready = [n for n, c in todo.items() if c.reference not in failed]
     failed += _all("case", ready, args.jobs, partial(_diagnose, args, todo))
     return 1 if failed or len(ready) < len(todo) else 0
+
+
+def run_ablations(args: argparse.Namespace) -> int:
+    """The cases without each step in turn. Returns 1 if something failed."""
+    failed = 0
+    for step in STEPS:
+        print(f"without {step}", flush=True)
+        less = argparse.Namespace(
+            **{**vars(args), "out": without(step), "flags": f"--no-{step.replace('_', '-')}", "placebos": False}
+        )
+        failed |= run_cases(less)
+    return failed
+
+
+def without(step: str) -> str:
+    """Folder of the answers without a step."""
+    return f"out_no_{step}"
 
 
 def _twin(work: Path, reference: str) -> Path:
@@ -224,17 +246,15 @@ def score_cases(args: argparse.Namespace) -> int:
     rows: list[Judgement] = []
     simple: dict[str, list[Judgement]] = {}
     missing, codes = [], set()
-    for case in chosen(drawn, args.only):
-        path = args.work / args.out / case.name / "diagnosis.json"
-        if not path.exists():
+    cases = chosen(drawn, args.only)
+    for case in cases:
+        row = _judged(args.work, args.out, case)
+        if row is None:
             missing.append(case.name)
             continue
         _check_truth(args.work, case)
-        said_by = path.with_name("code.txt")
-        codes.add(said_by.read_text(encoding="utf-8") if said_by.exists() else "")
-        rows.append(judged(case.name, case.reference, case.hidden, _json(path), base=_base(path.parent),
-                           oracle=_json(args.work / "oracle" / f"{case.name}.json"),
-                           paired=_json(args.work / "paired" / f"{case.name}.json")))  # fmt: skip
+        codes.add(_code_of(args.work, args.out, case))
+        rows.append(row)
         for method, answer in (_json(args.work / "baselines" / f"{case.name}.json") or {}).items():
             simple.setdefault(method, []).append(judged(case.name, case.reference, case.hidden, answer, {}, None,
                                                         _json(args.work / "paired" / f"{case.name}.json")))
@@ -243,11 +263,30 @@ def score_cases(args: argparse.Namespace) -> int:
     result = scores(rows, placebos=args.placebos)
     if simple:
         result["baselines"] = compare({"diagnosis": rows, **simple})
+    less = {step: [_judged(args.work, without(step), case) for case in cases] for step in STEPS}
+    if any(row for found in less.values() for row in found):
+        codes |= {_code_of(args.work, without(s), c) for s in STEPS for c, r in zip(cases, less[s], strict=True) if r}
+        result["ablations"] = ablated(rows, {s: [r for r in found if r] for s, found in less.items() if any(found)})
     print(markdown(result))
     print(f"\n{len(rows)} cases scored, {len(missing)} without an answer{': ' + ', '.join(missing) if missing else ''};"
           f" answers of {len(codes)} version{'s' * (len(codes) > 1)} of the code")  # fmt: skip
     (args.work / args.out / "scores.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     return 0
+
+
+def _judged(work: Path, out: str, case: Case) -> Judgement | None:
+    """What an answer is worth; None: it is not there."""
+    answer = work / out / case.name
+    said = _json(answer / "diagnosis.json")
+    if said is None:
+        return None
+    beside = {what: _json(work / what / f"{case.name}.json") for what in ("oracle", "paired")}
+    return judged(case.name, case.reference, case.hidden, said, base=_base(answer), **beside)
+
+
+def _code_of(work: Path, out: str, case: Case) -> str:
+    path = work / out / case.name / "code.txt"
+    return path.read_text(encoding="utf-8") if path.exists() else ""
 
 
 def _json(path: Path) -> Any:

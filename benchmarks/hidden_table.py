@@ -58,6 +58,13 @@ def compare(methods: Mapping[str, Rows]) -> list[dict[str, Any]]:
     return _table(columns, METRICS[:COMPARED])
 
 
+def ablated(whole: Rows, without: Mapping[str, Rows]) -> list[dict[str, Any]]:
+    """Rows as in the table: the diagnosis as it is beside itself without each step, on the cases that all answered."""
+    common = set.intersection(*({r.name for r in rows} for rows in (whole, *without.values())))
+    columns = {"as it is": whole, **{f"without {step}": rows for step, rows in without.items()}}
+    return _table({c: [r for r in rows if r.name in common] for c, rows in columns.items()}, METRICS[:ABLATED])
+
+
 def _table(columns: Mapping[str, Rows], metrics: Sequence[Metric]) -> list[dict[str, Any]]:
     return [
         {"metric": metric, "goal": goal, "cells": {c: cell(chosen) for c, chosen in columns.items()}}
@@ -173,6 +180,7 @@ METRICS: tuple[Metric, ...] = (
     ("time, median", "<= 300 s", number(lambda r: r.seconds, 0.5, "s")),
     ("time, 90th percentile", "", number(lambda r: r.seconds, 0.9, "s")),
 )  # fmt: skip
+ABLATED = 1 + next(n for n, (metric, _, _) in enumerate(METRICS) if metric.startswith("one effect: right family"))
 COMPARED = next(n for n, (metric, _, _) in enumerate(METRICS) if metric.startswith("parameter error"))
 EVERY = ("control", "single", "unlisted", "pair")
 FAKES: Metric = ("a law that nothing obeys is named", "0", share(EVERY, lambda r: "placebo" in r.families))
@@ -204,6 +212,8 @@ def markdown(result: Mapping[str, Any]) -> str:
     ]
     if "baselines" in result:
         lines += ["", "The same cases, answered by simpler ways.", "", *_rows(result["baselines"])]
+    if "ablations" in result:
+        lines += ["", "Each step left out, on the cases that all of these answered.", "", *_rows(result["ablations"])]
     matrix = result["confusion"]
     answers = sorted({a for line in matrix.values() for a in line})
     lines += ["", "Families: hidden (rows), answered first (columns).", ""]

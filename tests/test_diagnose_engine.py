@@ -19,7 +19,7 @@ from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals, set_limit, simplest
 from pred_core.diagnose.fit import Fit, fit, rho, without_groups
 from pred_core.diagnose.journal import Journal
-from pred_core.diagnose.judge import Bench
+from pred_core.diagnose.judge import Bench, judge, screen
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.run import diagnose
 from pred_core.diagnose.sample import Sample, make_sample
@@ -332,6 +332,54 @@ def test_a_chaotic_window_counts_less(twin: Twin) -> None:
     weights = weigh(Roller(twin, sample), Candidate(twin.physics, twin.extensions), 2, None, 0)
     hanging, standing = (weights[sample.episode == n][:, -1, 1:].median() for n in (0, 1))
     assert float(standing) < 0.7 * float(hanging)
+
+
+def switched_off(step: str) -> DiagnoseConfig:
+    return dataclasses.replace(SMALL, **{step: False})
+
+
+def test_a_step_left_out_is_left_out(twin: Twin, dragged: list[Episode], reference: list[Episode]) -> None:
+    """Starts raw from two frames instead of estimated: 0.3 mm of noise on them, and no frame after the start in them.
+    Without chaos weights and misfit a residual counts as its noise allows.
+    """
+    raw = make_sample(reference[:1], twin, 0.3, settle=False)
+    frame = int(raw.frame[0])
+    assert np.allclose(raw.windows.start.position[0, 1:], reference[0].position[frame, 1:], atol=1e-6)
+    backward = (reference[0].position[frame] - reference[0].position[frame - 1]) / PERIOD
+    assert np.allclose(raw.windows.start.velocity[0, 1:], backward[1:], atol=1e-4)
+    estimated = make_sample(reference[:1], twin, 0.3)
+    assert not np.allclose(estimated.windows.start.velocity[0, 1:], backward[1:], atol=1e-3)
+    roller = Roller(twin, raw)
+    weights = weigh(roller, Candidate(twin.physics, twin.extensions), 2, None, 0, chaos=False)
+    assert torch.allclose(weights, torch.full_like(weights, 1.0 / raw.noise))
+    plain = bench_of(twin, dragged[:2], reference[:2])
+    for step in ("settle", "chaos_weights"):
+        bench = commission(twin, dragged[:2], reference[:2], switched_off(step), quiet, Journal(None, {}))
+        one, other = (b.target.roller.sample.windows.start.velocity for b in (bench, plain))
+        assert torch.equal(one, other) == (step != "settle")
+        assert not torch.equal(bench.target.weights, plain.target.weights)
+
+
+def test_without_cross_fit_and_back_fit_a_candidate_flatters_itself(
+    twin: Twin, dragged: list[Episode]
+) -> None:
+    """Judged by the parameters fitted on it, a train episode cannot look worse on average; test episodes are as ever.
+    Without the back-fit "no change" is drag of exactly 0, with it the 0.5 /s that the reference has, too.
+    """
+    bench = bench_of(twin, dragged, recorded(twin, drag(coefficient=0.5), SPLITS, seed=100, frames=40))
+    effects = (find_effect("drag_linear"),)
+    screened = screen(bench, effects, np.random.default_rng(0), Journal(None, {}), "x")
+
+    def judge_without(step: str) -> Judged:
+        changed = dataclasses.replace(bench, config=switched_off(step)) if step else bench
+        return judge(changed, screened, Journal(None, {}), "x")
+
+    usual, flattered, plain = (judge_without(s) for s in ("", "cross_fit", "back_fit"))
+    assert flattered.extended[:5].mean() < usual.extended[:5].mean()
+    assert flattered.extended[5] == usual.extended[5] and flattered.values == usual.values
+    (name,) = usual.null
+    assert plain.null[name] == 0.0 and usual.null[name] == pytest.approx(0.5, abs=0.05)
+    assert (plain.gain != usual.gain).any() and (plain.extended == usual.extended).all()
 
 
 # The whole ------------------------------------------------------------------------------------------------------------

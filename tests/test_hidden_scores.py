@@ -282,6 +282,43 @@ def test_scores_are_written_and_foreign_truths_refused(
         bench["hidden_effects"].main()
 
 
+def test_each_step_is_left_out_in_turn_and_compared_on_the_same_cases(
+    bench: dict[str, ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two controls. With all steps both are none; without cross-fitting the one that it answered is a false alarm."""
+    effects = bench["hidden_effects"]
+    controls = [c for c in bench["hidden_cases"].release("final").cases if not c.hidden][:2]
+    calls = []
+
+    def pred(words: Sequence[str], log: Path, program: Sequence[str] = ()) -> int:
+        calls.append(words)
+        return 0
+
+    monkeypatch.setattr(effects, "_pred", pred)
+    monkeypatch.setattr(effects, "_all", lambda what, names, jobs, do: [n for n in names if do(n)])
+    monkeypatch.setattr(effects, "simulate", lambda root, hidden, seed: None)
+    one = controls[0].name
+    monkeypatch.setattr(sys, "argv", ["x", "ablate", "--work", str(tmp_path), "--only", one])
+    assert effects.main() == 0
+    diagnosed = [words for words in calls if words[0] == "diagnose"]
+    steps = ("settle", "back_fit", "cross_fit", "chaos_weights")
+    assert [Path(w[w.index("--out") + 1]).parent.name for w in diagnosed] == [f"out_no_{s}" for s in steps]
+    assert [w[-1] for w in diagnosed] == ["--no-settle", "--no-back-fit", "--no-cross-fit", "--no-chaos-weights"]
+    named = answer("named", ("drag_linear", {"coefficient": (1.0, 0.5, 1.5)}), ranking=[("drag_linear", 0.9)])
+    none = answer("none", ranking=[("none", 0.9)])
+    for case in controls:
+        (tmp_path / f"{case.name}.truth.json").write_text(json.dumps({"hidden": [], "seed": case.seed}))
+    for out, name, said in (("out", one, none), ("out", controls[1].name, none), ("out_no_cross_fit", one, named)):
+        (tmp_path / out / name).mkdir(parents=True, exist_ok=True)
+        (tmp_path / out / name / "diagnosis.json").write_text(json.dumps(said))
+    monkeypatch.setattr(sys, "argv", ["x", "score", "--work", str(tmp_path), "--only", *(c.name for c in controls)])
+    assert effects.main() == 0
+    shown = capsys.readouterr().out.splitlines()
+    row = next(n for n, line in enumerate(shown) if line.startswith("|") and "without cross_fit" in line)
+    assert "without settle" not in shown[row]
+    assert "0/1 = 0 %" in shown[row + 2] and "1/1 = 100 %" in shown[row + 2]  # controls: anything but none
+
+
 def test_fake_laws_are_six_null_at_null_and_only_in_their_own_process(bench: dict[str, ModuleType]) -> None:
     placebos = bench["hidden_placebos"].PLACEBOS
     assert len(placebos) == 6 and not {e.id for e in placebos} & set(LIBRARY)

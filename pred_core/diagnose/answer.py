@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pred_core.config import to_mapping
 from pred_core.diagnose.causes import causes_of, evidence_of
 from pred_core.diagnose.errors import EpisodeErrors, episode_errors, gain_of
 from pred_core.diagnose.gate import GateResult
@@ -65,6 +66,7 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         twin=_twin(study, progress, causes),
         seconds=0.0,
         seed=config.seed,
+        settings=to_mapping(config),
     )
     result = dataclasses.replace(result, next_motion=propose(result, study.corrected, config.seed))
     return dataclasses.replace(result, sentence=sentence(result), seconds=time.monotonic() - begin)
@@ -152,6 +154,8 @@ def _notes(study: Study, progress: Progress, errors: Errors, ood: Errors | None)
                 rows.append(f"{title}: the simulation diverged in {', '.join(side.diverged)}; counted as 0.5 m")
     if study.bench.reference is None:
         rows.append("no reference: what the engine and the object lack in common may carry a cause's name")
+    if study.bench.config.left_out:
+        rows.append(f"left out to measure what they are worth: {', '.join(study.bench.config.left_out)}")
     if study.given.residual is not None:
         rows.append("the twin's network was left out: the base is its simulation alone")
     return tuple(rows)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.fit import Target, fit
@@ -16,7 +17,7 @@ from pred_core.diagnose.judge import Bench, Tell
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.sample import Sample, make_sample
 from pred_core.diagnose.trial import make_trial
-from pred_core.diagnose.weigh import misfit_of, seen_of, weigh
+from pred_core.diagnose.weigh import Weights, misfit_of, seen_of, weigh
 from pred_core.effects import find_effect
 from pred_core.errors import ConfigError, DatasetError
 from pred_core.identify.space import Candidate
@@ -53,8 +54,8 @@ def commission(
 
     Raises: DatasetError if the twin does not describe the data at all.
     """
-    sample = make_sample(suspect, twin, config.window, session)
-    known = make_sample(reference, twin, config.window) if reference else None
+    sample = make_sample(suspect, twin, config.window, session, config.settle)
+    known = make_sample(reference, twin, config.window, None, config.settle) if reference else None
     judged_on = known or sample
     frames = len(sample.windows.target)
     if config.stride > frames:
@@ -69,19 +70,23 @@ def commission(
     twin = with_stored(twin, journal.once("base", lambda: values_of(_polish(twin, judged_on, use, config, tell))))
     roller = Roller(twin, judged_on)
     as_it_is = Candidate(twin.physics, twin.extensions)
-    plain = weigh(roller, as_it_is, config.stride, None, config.seed)
+    plain = _weigh(roller, as_it_is, config, None)
     errors = roller.errors([as_it_is], config.stride)[0]
     misfit = misfit_of(errors, seen_of(roller, config.stride), plain)
     if known is None:  # the suspect's own misfit holds what is looked for: little of it is taken as the model's
         misfit = OWN_MISFIT * misfit
     own = Roller(twin, sample)
-    target = Target(own, weigh(own, as_it_is, config.stride, misfit, config.seed), config.stride)
+    target = Target(own, _weigh(own, as_it_is, config, misfit), config.stride)
     other = None
     if known is not None:
-        other = Target(roller, weigh(roller, as_it_is, config.stride, misfit, config.seed), config.stride)
+        other = Target(roller, _weigh(roller, as_it_is, config, misfit), config.stride)
     physics = () if known is not None else base_fields(twin)
     train = np.flatnonzero(np.array([s == "train" for s in sample.splits]))
     return Bench(twin, target, target.part(train.tolist()), twin, other, config, (), physics)
+
+
+def _weigh(roller: Roller, candidate: Candidate, config: DiagnoseConfig, misfit: Tensor | None) -> Weights:
+    return weigh(roller, candidate, config.stride, misfit, config.seed, config.chaos_weights)
 
 
 def with_values(twin: Twin, candidate: Candidate) -> Twin:
@@ -117,7 +122,7 @@ def _polish(twin: Twin, sample: Sample, use: NDArray[np.bool_], config: Diagnose
     most = ROOM * Roller(twin, sample).usual()
     for _ in range(2):  # the weights follow the parameters
         roller = Roller(twin, sample)
-        weights = weigh(roller, Candidate(twin.physics, twin.extensions), config.stride, None, config.seed)
+        weights = _weigh(roller, Candidate(twin.physics, twin.extensions), config, None)
         target = Target(roller, weights, config.stride)
         standing = tuple(find_effect(e.id) for e in twin.extensions)
         narrow = tuple(e for e in standing if sum(q.size for q in e.parameters) <= 4)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from pred_core.config import setting
 
+STEPS = ("settle", "back_fit", "cross_fit", "chaos_weights")  # that can be left out, to measure what each is worth
+
 
 @dataclass(frozen=True)
 class DiagnoseConfig:
@@ -23,4 +25,15 @@ class DiagnoseConfig:
     iterations: int = setting(8, low=1, high=100, doc="steps of a refinement")
     causes: int = setting(3, low=1, high=8, doc="most causes that are named together")
     seconds: float = setting(300.0, unit="s", low=1.0, high=86400.0, doc="time it aims at; the screening always ends")
+    settle: bool = setting(True, doc="windows start from an estimate over several frames; off: raw from two")
+    back_fit: bool = setting(
+        True, doc="no change is what the reference says of a candidate, or a base refined anew; off: the twin as it is"
+    )
+    cross_fit: bool = setting(True, doc="train episodes are judged by parameters that did not see them")
+    chaos_weights: bool = setting(True, doc="residuals count less where perturbed starts spread")
     seed: int = setting(0, low=0, high=2**31 - 1, doc="of places, perturbed starts and sign flips")
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Steps that are switched off."""
+        return tuple(s for s in STEPS if not getattr(self, s))

@@ -107,6 +107,8 @@ def null_of(bench: Bench, screened: Screened, found: Array) -> Array:
     same budget, from off and from where the suspect set led (`found`): a fit that ended early would look like a change.
     """
     trial = screened.trial
+    if not bench.config.back_fit:
+        return screened.null
     if bench.reference is None:
         return _back_fit(bench, screened, found)
     other = make_trial(bench.reference_twin, screened.effects, ())
@@ -171,7 +173,7 @@ def _judge(bench: Bench, screened: Screened) -> dict[str, object]:
     u = target.residuals(space, [null, result.z, *left_out.values()])
     losses = target.per_episode(rho(u))
     extended = losses[1].copy()
-    for row, group in enumerate(left_out):
+    for row, group in enumerate(left_out if bench.config.cross_fit else ()):
         mine = sample.groups == group  # also test episodes of that recording
         extended[mine] = losses[2 + row][mine]
     moved = np.sqrt(np.maximum(target.per_episode((u[1] - u[0]).square()[None])[0], 0.0))

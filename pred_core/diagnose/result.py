@@ -85,6 +85,7 @@ class Diagnosis:
     twin: Twin  # carries what was named
     seconds: float
     seed: int
+    settings: Mapping[str, Any] = field(default_factory=dict)  # of the run
 
     def to_json(self) -> dict[str, Any]:
         """`diagnosis.json` (DESIGN.md, and beside it what the report shows)."""
@@ -115,6 +116,7 @@ class Diagnosis:
             "gate": self.gate.to_json(),
             "seconds": self.seconds,
             "seed": self.seed,
+            "settings": dict(self.settings),
         }  # fmt: skip
 
 

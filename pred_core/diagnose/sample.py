@@ -85,11 +85,13 @@ class Sample:
         return np.asarray(total / np.maximum(count, 1))
 
 
-def make_sample(episodes: Sequence[Episode], twin: Twin, window: float, begin: int | None = None) -> Sample:
+def make_sample(
+    episodes: Sequence[Episode], twin: Twin, window: float, begin: int | None = None, settle: bool = True
+) -> Sample:
     """Windows of `window` [s] of these episodes, one after the other, each as long as the others.
 
-    `begin` [ns]: when the session began; absent: with the first episode. Raises: DatasetError if an episode is too
-    short or has no complete frame to start from.
+    `begin` [ns]: when the session began; absent: with the first episode. `settle`: starts are estimated over several
+    frames, else raw from two. Raises: DatasetError if an episode is too short or has no complete frame to start from.
     """
     even = [on_even_clock(e) for e in episodes]
     period = twin.meta.period
@@ -114,7 +116,7 @@ def make_sample(episodes: Sequence[Episode], twin: Twin, window: float, begin: i
         names=tuple(e.name for e in even),
         groups=np.array([e.recording for e in even], dtype=np.int64),
         splits=tuple(e.split for e in even),
-        windows=make_windows(recordings, index, steps, period, noise),
+        windows=make_windows(recordings, index, steps, period, noise if settle else None),
         episode=np.array([n for _, n, _ in rows], dtype=np.int64),
         order=np.array([o for o, _, _ in rows], dtype=np.int64),
         frame=np.array([f for _, _, f in rows], dtype=np.int64),

@@ -72,7 +72,7 @@ def question(bench: Bench, journal: Journal, tell: Tell) -> tuple[Bench, Judged,
     twin = with_stored(slim, stored["twin"])
     base = _losses(before, target)
     extended = _losses(twin, target)
-    for group, values in stored["without"]:
+    for group, values in stored["without"] if bench.config.cross_fit else ():
         mine = target.roller.sample.groups == group
         if mine.any():
             extended[mine] = _losses(with_stored(slim, values), target)[mine]

@@ -20,10 +20,13 @@ START = 0.5  # standard deviation of a start's position over the track noise; of
 Weights = Tensor  # (W, K, N) [1/m]
 
 
-def weigh(roller: Roller, candidate: Candidate, stride: int, misfit: Tensor | None, seed: int) -> Weights:
+def weigh(
+    roller: Roller, candidate: Candidate, stride: int, misfit: Tensor | None, seed: int, chaos: bool = True
+) -> Weights:
     """1 / standard deviation of a residual of this sample.
 
-    `misfit` (K,) [m^2]: variance a frame of a window that the reference already has; absent: none is known.
+    `misfit` (K,) [m^2]: variance a frame of a window that the reference already has; absent: none is known. `chaos`:
+    the spread of perturbed starts counts.
     """
     sample = roller.sample
     generator = torch.Generator().manual_seed(seed)
@@ -31,7 +34,7 @@ def weigh(roller: Roller, candidate: Candidate, stride: int, misfit: Tensor | No
     free = (w.start.held < 0).unsqueeze(-1)
     base = roller.errors([candidate], stride)[0]
     spread = torch.zeros(base.shape[:-1])
-    for _ in range(DRAWS):
+    for _ in range(DRAWS if chaos else 0):
         shape, size = w.start.position.shape, free * START * sample.noise
         draw = [torch.randn(shape, generator=generator) * size for _ in range(2)]
         start = w.start.replace(
