@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def read_nodes(file: Path, overrides: Sequence[str] = ()) -> dict[str, dict[str, Any]]:
-    """Node -> parameters. Raises: ConfigError for another layout, an unknown node or a malformed override."""
+    """Node -> parameters, with the overrides. Raises: ConfigError for another layout or an unknown node."""
     content = load_yaml(file)
     if not isinstance(content, dict) or not content:
         raise ConfigError(f"{file}: no nodes", allowed=", ".join(NODES))
@@ -52,13 +52,18 @@ def read_nodes(file: Path, overrides: Sequence[str] = ()) -> dict[str, dict[str,
         if not isinstance(entry, dict) or set(entry) != {PARAMETERS} or not isinstance(entry[PARAMETERS] or {}, dict):
             raise ConfigError(f"{file}: {name}", got=repr(entry)[:80], allowed=f"a mapping '{PARAMETERS}'")
         nodes[name] = dict(entry[PARAMETERS] or {})
+    apply_overrides(nodes, overrides)
+    return nodes
+
+
+def apply_overrides(nodes: dict[str, dict[str, Any]], overrides: Sequence[str]) -> None:
+    """Set what NODE.PARAMETER=VALUE says. Raises: ConfigError for a malformed one or a node that is not there."""
     for override in overrides:
         target, equals, value = override.partition("=")
         node, dot, parameter = target.partition(".")
         if not equals or not dot or node not in nodes:
             raise ConfigError(f"override '{override}'", allowed=f"NODE.PARAMETER=VALUE with {', '.join(nodes)}")
         nodes[node][parameter] = yaml.safe_load(value)
-    return nodes
 
 
 def run(nodes: dict[str, dict[str, Any]], domain: int | None, logs: Path | None) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn, Protocol, cast
 
@@ -67,7 +68,7 @@ class Shell(LifecycleNode):
         parameters.follow(self, lambda: self.config, self._accept)
         self.exit_code: int | None = None
         self.bug: BaseException | None = None
-        self.diagnostics = Diagnostics(self.get_fully_qualified_name())
+        self.diagnostics = Diagnostics(self.get_fully_qualified_name(), self.seconds)
         self._diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._timer = self.create_timer(1.0, self._heartbeat)
         self._own = self._made()  # outlives a cleanup
@@ -108,6 +109,11 @@ class Shell(LifecycleNode):
     def publish_diagnostics(self) -> None:
         """Publish the diagnostic status now."""
         self._diagnostics_out.publish(self.diagnostics.message_at(self.get_clock().now().to_msg()))
+
+    def seconds(self) -> float:
+        """[s] For ages and deadlines: simulated time where there is one, it may be slower than the wall's."""
+        clock: Any = self.get_clock()
+        return clock.now().nanoseconds * 1e-9 if clock.ros_time_is_active else time.monotonic()
 
     def fail(self, error: PredError) -> None:
         """End the process with one clear line."""
