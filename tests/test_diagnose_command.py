@@ -201,6 +201,25 @@ def test_a_twin_of_another_object(world: Path, tmp_path: Path, capsys: pytest.Ca
     assert "diverges or is not of this object" in line and "Identify a twin" in line
 
 
+def test_a_wrong_twin_is_no_base(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Far too stiff, the rope rings so wildly that perturbed starts excuse every residual: nothing would be found. A
+    hundred times it explains 40 % of the motion, a thousand times it is worse than no motion; refined on the reference
+    it must explain half.
+    """
+    twin = rope()
+    stiff = twin.replace(physics=dataclasses.replace(twin.physics, stiffness=1000.0 * twin.physics.stiffness))
+    stiff.save(tmp_path / "stiff")
+    against = ("--reference", str(world / "reference"))
+    line = refusal(capsys, world / "suspect", tmp_path / "stiff", tmp_path / "out", *against)
+    assert "does not describe the reference" in line and "Identify a twin anew" in line
+    assert re.search(r"got \d+ mm of error where the object moves by \d+ mm; allowed: at most 50%", line)
+
+
+def test_a_good_twin_explains_the_motion(found: Path) -> None:
+    """With the drag in it: noise and chaos are a few per cent of what the rope moves in a second."""
+    assert read(found)["motion_explained"] > 0.9
+
+
 def test_an_absurd_stiffness(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     twin = rope()
     twin.replace(physics=dataclasses.replace(twin.physics, stiffness=1e9)).save(tmp_path / "twin")

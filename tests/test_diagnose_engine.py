@@ -11,18 +11,21 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from report_cases import PERIOD, drag, judged, recorded, rope
+from report_cases import PERIOD, answer, drag, judged, recorded, rope, with_errors
 
 from pred_core.diagnose import evidence
-from pred_core.diagnose.commission import commission
+from pred_core.diagnose.commission import commission, values_of
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals, set_limit, simplest
 from pred_core.diagnose.fit import Fit, fit, rho, without_groups
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Bench, judge, screen
 from pred_core.diagnose.roll import Roller
+from pred_core.diagnose.rounds import Progress, finish
 from pred_core.diagnose.run import diagnose
+from pred_core.diagnose.said import sentence
 from pred_core.diagnose.sample import Sample, make_sample
+from pred_core.diagnose.skill import skill_of
 from pred_core.diagnose.trial import Trial, make_trial
 from pred_core.diagnose.weigh import weigh
 from pred_core.effects import find_effect
@@ -380,6 +383,34 @@ def test_without_cross_fit_and_back_fit_a_candidate_flatters_itself(
     (name,) = usual.null
     assert plain.null[name] == 0.0 and usual.null[name] == pytest.approx(0.5, abs=0.05)
     assert (plain.gain != usual.gain).any() and (plain.extended == usual.extended).all()
+
+
+def test_a_base_that_predicts_nothing_is_never_good_enough(
+    twin: Twin, dragged: list[Episode], reference: list[Episode]
+) -> None:
+    """A thousand times too stiff, perturbed starts excuse all of its error: the loss is that of noise, 0.4. Without a
+    name it is said to be unknown, with the reason; the right twin explains nearly all and lacks only the drag.
+    """
+    wild = twin.replace(physics=dataclasses.replace(twin.physics, stiffness=1000.0 * twin.physics.stiffness))
+    ends = {}
+    for name, one, against in (("wild", wild, ()), ("right", twin, reference)):
+        journal = Journal(None, {})
+        journal.known["base"] = values_of(one)
+        bench = commission(one, reference if name == "right" else dragged, against, SMALL, quiet, journal)
+        ends[name] = Progress(bench, journal, [bench.twin])
+        finish(ends[name])
+    assert float(ends["wild"].bench.standing().mean()) < 1.0  # alone it would have passed
+    assert ends["wild"].unknown and ends["wild"].explained < 0.3
+    assert not ends["right"].unknown and ends["right"].explained > 0.9
+    said = dataclasses.replace(answer(twin, dragged, "unknown"), causes=(), explained=0.2)
+    alone, beside = (with_errors(said, [50.0], [50.0], floor) for floor in (None, 5.0))
+    assert "20% of the motion, too little" in sentence(dataclasses.replace(said, errors=alone))
+    assert "no candidate explains" in sentence(dataclasses.replace(said, errors=beside))
+
+
+def test_what_hardly_moves_says_nothing_of_a_twin(twin: Twin) -> None:
+    still = recorded(twin, (), ("train",), frames=20, size=0.0)
+    assert skill_of(twin, Roller(twin, make_sample(still, twin, 0.3)), 2) is None
 
 
 # The whole ------------------------------------------------------------------------------------------------------------

@@ -66,6 +66,7 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         twin=_twin(study, progress, causes),
         seconds=0.0,
         seed=config.seed,
+        explained=progress.explained,
         settings=to_mapping(config),
     )
     result = dataclasses.replace(result, next_motion=propose(result, study.corrected, config.seed))

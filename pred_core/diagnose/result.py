@@ -85,6 +85,7 @@ class Diagnosis:
     twin: Twin  # carries what was named
     seconds: float
     seed: int
+    explained: float | None = None  # share of the motion in windows of held-out episodes; None: it hardly moves
     settings: Mapping[str, Any] = field(default_factory=dict)  # of the run
 
     def to_json(self) -> dict[str, Any]:
@@ -102,6 +103,7 @@ class Diagnosis:
                 for r in self.ranking
             ],
             "error_mm": _errors(e),
+            "motion_explained": self.explained,
             "error_mm_ood": {} if self.errors_ood is None else _errors(self.errors_ood),
             "gain": {
                 "mean_mm": e.gain.mean, "low_mm": e.gain.low, "high_mm": e.gain.high,

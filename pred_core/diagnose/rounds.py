@@ -17,6 +17,7 @@ from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import QUICK, Bench, Effects, Screened, Tell, judge, quick, rng_of, screen
 from pred_core.diagnose.roll import on_ground
 from pred_core.diagnose.search import Start
+from pred_core.diagnose.skill import POOR, skill_of
 from pred_core.diagnose.trial import NOT_A_NAME, make_trial
 from pred_core.effects import LIBRARY
 from pred_core.twin import Twin
@@ -72,6 +73,7 @@ class Progress:
     rounds: list[Round] = field(default_factory=list)
     unknown: bool = False
     unknown_p: float = 1.0
+    explained: float | None = None  # share of the motion, in the end; None: the object hardly moves
     notes: list[str] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)  # effect -> why it cannot be tried
 
@@ -179,18 +181,24 @@ def _something_left(progress: Progress, base: Array, floor: float) -> bool:
 def finish(progress: Progress) -> None:
     """Decide whether something is left that has no name."""
     bench = progress.bench
+    found = skill_of(bench.twin, bench.target.roller, bench.config.stride)
+    progress.explained = None if found is None else found.share
+    poor = found is not None and found.share < POOR
     if bench.reference is None:
-        progress.unknown = not progress.named and float(bench.standing().mean()) > UNEXPLAINED * NOISE
+        loud = not progress.named and float(bench.standing().mean()) > UNEXPLAINED * NOISE
+        progress.unknown = loud or poor
         return
     suspect, reference = bench.standing(), _reference_losses(bench)
     if min(len(suspect), len(reference)) < FEWEST:
-        progress.unknown = not progress.named and float(suspect.mean()) > UNEXPLAINED * float(reference.mean())
+        loud = float(suspect.mean()) > UNEXPLAINED * float(reference.mean())
+        progress.unknown = not progress.named and (loud or poor)
         return
     p = lack_of_fit(
         suspect, reference, bench.config.seed, on_ground(bench.target.roller), on_ground(bench.reference.roller)
     )
     progress.unknown_p = p
-    progress.unknown = p < SURE and float(suspect.mean()) > (1.0 + LEFT) * float(reference.mean())
+    lacking = p < SURE and float(suspect.mean()) > (1.0 + LEFT) * float(reference.mean())
+    progress.unknown = lacking or (poor and not progress.named)
 
 
 def extend(bench: Bench, judged: Judged) -> Bench:

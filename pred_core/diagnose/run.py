@@ -14,6 +14,7 @@ from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Tell
 from pred_core.diagnose.result import Diagnosis
 from pred_core.diagnose.rounds import Named, Progress, finish, one_round
+from pred_core.diagnose.skill import check_reference
 from pred_core.diagnose.structure import applies, question
 from pred_core.errors import DatasetError
 from pred_core.twin import Twin
@@ -49,6 +50,7 @@ def diagnose(
     fitted = [e for e in corrected if e.split != "ood"]
     _check_ids(fitted, known, plain)
     bench = commission(plain, fitted, known, config, tell, journal, session)
+    check_reference(bench)
     progress = Progress(bench, journal, [bench.twin], deadline=begin + LATEST * config.seconds)
     if bench.reference is None and applies(bench.twin):
         _change_structure(progress, tell)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pred_core.diagnose.skill import POOR
 from pred_core.types import Episode
 
 if TYPE_CHECKING:
@@ -64,6 +65,9 @@ def sentence(d: Diagnosis) -> str:
     label = "Exploratory, too few episodes for a firm answer: " if d.exploratory else ""
     if d.outcome == "none":
         return f"{label}Nothing is found that your simulation lacks: its {held} is {e.base.mean:.1f} mm."
+    if d.outcome == "unknown" and _no_base(d):
+        share = f"{max(d.explained or 0.0, 0.0):.0%} of the motion"
+        return f"{label}Your twin explains {share}, too little to tell what it lacks: identify it anew; {numbers}."
     if d.outcome == "unknown":
         near = ", ".join(NAMES.get(c.id, c.id) for c in d.causes)
         partly = f" ({near} explains a part)" if near else ""
@@ -72,6 +76,13 @@ def sentence(d: Diagnosis) -> str:
     group = tuple(g for c in d.causes for g in c.group)
     unsure = f" (or {', '.join(NAMES.get(g, g) for g in group)}: these data do not tell)" if group else ""
     return f"{label}Your simulation lacks {what}{unsure}; with it {numbers}."
+
+
+def _no_base(d: Diagnosis) -> bool:
+    """The twin is no good where nothing is hidden either, as far as that was measured."""
+    if d.explained is None or d.explained >= POOR:
+        return False
+    return d.errors.floor is None or d.errors.floor > 0.5 * d.errors.extended.mean
 
 
 def not_identifiable(progress: Progress, episodes: Sequence[Episode]) -> list[str]:
