@@ -10,8 +10,8 @@ import torch
 from pred_core.diagnose.errors import EpisodeErrors, episode_errors, gain_of
 from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.gate import GateCause, GateResult
+from pred_core.diagnose.progress import Round
 from pred_core.diagnose.result import Cause, Diagnosis, Errors, Ranked, Value
-from pred_core.diagnose.rounds import Round
 from pred_core.diagnose.trial import make_trial
 from pred_core.effects import find_effect
 from pred_core.frames import quaternion_from_rotation_vector

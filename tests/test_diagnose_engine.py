@@ -20,8 +20,9 @@ from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals
 from pred_core.diagnose.fit import Fit, fit, rho, without_groups
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Bench, judge, screen
+from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.roll import Roller
-from pred_core.diagnose.rounds import Progress, finish
+from pred_core.diagnose.rounds import finish
 from pred_core.diagnose.run import diagnose
 from pred_core.diagnose.said import sentence
 from pred_core.diagnose.sample import Sample, make_sample

@@ -14,11 +14,12 @@ from pred_core.diagnose.causes import causes_of, evidence_of
 from pred_core.diagnose.errors import EpisodeErrors, episode_errors, gain_of
 from pred_core.diagnose.gate import GateResult
 from pred_core.diagnose.judge import Bench, Tell
+from pred_core.diagnose.naming import FEWEST
 from pred_core.diagnose.next_motion import propose
+from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.ranking import ranking
 from pred_core.diagnose.result import Cause, Diagnosis, Errors
 from pred_core.diagnose.roll import Roller
-from pred_core.diagnose.rounds import FEWEST, Progress
 from pred_core.diagnose.said import not_identifiable, sentence
 from pred_core.twin import Twin
 from pred_core.types import Episode
@@ -144,7 +145,7 @@ def _not_testable(gate: GateResult, progress: Progress) -> Mapping[str, str]:
     for judged, _, why in (row for r in progress.rounds for row in r.judged):
         if why.startswith("acts in"):
             rows[judged.trial.id] = f"these motions hardly excite it: it {why}"
-    return {**rows, **progress.skipped}
+    return rows
 
 
 def _notes(study: Study, progress: Progress, errors: Errors, ood: Errors | None) -> tuple[str, ...]:

@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from pred_core.diagnose.gate import GateCause, GateResult
+from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.result import Cause, Value
-from pred_core.diagnose.rounds import Named, Progress
 from pred_core.diagnose.structure import FAMILY, ID
 from pred_core.effects import LIBRARY, find_effect
 from pred_core.twin import Extension

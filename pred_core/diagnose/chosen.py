@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pred_core.diagnose.evidence import Judged
+from pred_core.diagnose.progress import Round
 from pred_core.diagnose.result import Cause
-from pred_core.diagnose.rounds import Round
 
 
 def chosen_of(rounds: Sequence[Round], causes: Sequence[Cause]) -> list[Judged | None]:

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.pictures_map import COLORS
+from pred_core.diagnose.progress import Round
 from pred_core.diagnose.result import Errors
-from pred_core.diagnose.rounds import Round
 from pred_core.evaluate.bootstrap import bootstrap_interval
 from pred_core.evaluate.style import GREY, GRID, INK, tidy
 from pred_core.types import Array

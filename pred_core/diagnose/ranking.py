@@ -7,8 +7,8 @@ import math
 
 from pred_core.diagnose.evidence import rivals
 from pred_core.diagnose.gate import GateResult
+from pred_core.diagnose.progress import Named, Progress, Round
 from pred_core.diagnose.result import Ranked
-from pred_core.diagnose.rounds import Named, Progress, Round
 
 SHARP = 1.0  # how fast a rival's weight falls with the standard errors it is behind
 COLD = 0.8  # without a reference: what engine and object lack in common can look like a cause

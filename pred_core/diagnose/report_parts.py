@@ -11,8 +11,8 @@ from pred_core.diagnose import pictures
 from pred_core.diagnose.chosen import chosen_of
 from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.gate_result import GateCause
+from pred_core.diagnose.progress import Round
 from pred_core.diagnose.result import Diagnosis, Errors
-from pred_core.diagnose.rounds import Round
 from pred_core.diagnose.said import NAMES
 from pred_core.effects import LIBRARY
 from pred_core.evaluate.bootstrap import bootstrap_interval

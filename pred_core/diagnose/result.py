@@ -8,7 +8,7 @@ from typing import Any
 
 from pred_core.diagnose.errors import EpisodeErrors, Gain
 from pred_core.diagnose.gate import GateResult
-from pred_core.diagnose.rounds import Round
+from pred_core.diagnose.progress import Round
 from pred_core.twin import Twin
 
 OUTCOMES = ("none", "named", "group", "unknown")

@@ -12,8 +12,9 @@ from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.gate import measure
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Tell
+from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.result import Diagnosis
-from pred_core.diagnose.rounds import Named, Progress, finish, one_round
+from pred_core.diagnose.rounds import finish, one_round
 from pred_core.diagnose.skill import check_reference
 from pred_core.diagnose.structure import applies, question
 from pred_core.errors import DatasetError

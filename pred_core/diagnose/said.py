@@ -11,8 +11,8 @@ from pred_core.diagnose.skill import POOR
 from pred_core.types import Episode
 
 if TYPE_CHECKING:
+    from pred_core.diagnose.progress import Progress
     from pred_core.diagnose.result import Cause, Diagnosis
-    from pred_core.diagnose.rounds import Progress
 
 NAMES = {
     "bending_by_angle": "resistance to bending by angle, instead of springs that skip particles",

@@ -114,8 +114,3 @@ def _normal(target: Target, now: torch.Tensor, moved: torch.Tensor, steps: Array
     for a in range(k):
         h[a] = target.per_episode(slopes * (slopes[a] * soft)).mean(axis=1)
     return g, h
-
-
-def loss_of(target: Target, space: SearchSpace, z: Array) -> Array:
-    """(E,) losses at one point."""
-    return target.per_episode(rho(target.residuals(space, [z])))[0]

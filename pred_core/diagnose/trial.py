@@ -24,7 +24,6 @@ class Trial:
     family: str
     space: SearchSpace
     amplitudes: tuple[int, ...]  # knobs that switch it on
-    doubles: bool = False  # one of the ids stands in the twin already: its values are refitted
 
     @property
     def id(self) -> str:
@@ -37,7 +36,6 @@ def make_trial(
 ) -> Trial:
     """A trial of these effects. `physics`: base parameters, `free`: effects of the twin, that are refitted with it."""
     ids = tuple(e.id for e in effects)
-    standing = {e.id for e in twin.extensions}
     space = search_space(twin.physics, physics, (*ids, *(f for f in free if f not in ids)), twin.extensions)
     amplitudes = []
     for n, knob in enumerate(space.knobs):
@@ -48,7 +46,7 @@ def make_trial(
         if parameter is switch(effect):
             amplitudes.append(n)
     family = "+".join(dict.fromkeys(e.family for e in effects))
-    return Trial(ids, family, space, tuple(amplitudes), bool(standing & set(ids)))
+    return Trial(ids, family, space, tuple(amplitudes))
 
 
 def switch(effect: type[Effect]) -> Parameter:

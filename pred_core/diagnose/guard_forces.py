@@ -1,0 +1,148 @@
+"""What the network adds, step by step, and what each candidate cause would have added in the same states."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pred_core.diagnose.guard_probes import Probe, Probes
+from pred_core.diagnose.roll import Roller
+from pred_core.diagnose.sample import Sample
+from pred_core.dynamics import FARTHEST, Dynamics
+from pred_core.effects import find_effect
+from pred_core.errors import InputError
+from pred_core.identify.space import Candidate
+from pred_core.pred import BASE, Advance, PReD
+from pred_core.springmass import SpringMass
+from pred_core.springmass.arrays import chains
+from pred_core.twin import Extension, Twin
+from pred_core.types import Array, Grip, State
+
+MOST_STATES = 6000  # (world, step) pairs that are compared
+
+
+@dataclass(frozen=True)
+class Path:
+    """Open-loop rollouts of W episodes with the network: states before each of K steps, and what it then added."""
+
+    states: list[State]  # K states (W, N, 3) of the backbone, with its memory
+    added: Tensor  # (K, W, N, 3) [m/s] the network's velocity
+    counts: Tensor  # (K, W, N) bool: free, measured in the episode, finite
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Sums of products over all that counts, for least squares: column p < P a probe's velocity, the last the network's.
+
+    A probe's velocity is what one period adds with it, minus without.
+    """
+
+    products: Array  # (G, P + 1, P + 1) [m^2/s^2]
+    groups: tuple[int, ...]  # (G,) recording of each
+    values: int  # free particles' velocities that were compared
+    speed: float  # [m/s] root mean square of the network's velocity a particle
+
+
+def backbone(twin: Twin, extensions: list[tuple[Extension, ...]] | tuple[Extension, ...], substeps: int) -> SpringMass:
+    """The twin's simulator with other effects; a world that diverges becomes NaN and leaves the others alone."""
+    return SpringMass(
+        twin.body, twin.physics, twin.scene, period=twin.meta.period, substeps=substeps, extensions=extensions,
+        diverged_as_nan=True,
+    )  # fmt: skip
+
+
+@torch.no_grad()
+def roll(model: PReD, sample: Sample) -> Path:
+    """Every first window of the sample, open loop with the network.
+
+    Raises: InputError if the network moves nothing at all.
+    """
+    w = sample.windows
+    state = model.start(w.start, w.start_grip)
+    memory = {**state.memory, BASE + "time": sample.time.clone()}
+    state = state.replace(memory=memory)
+    states, added, counts = [], [], []
+    for k in range(len(w.target)):
+        before = model.base_state(state)
+        step: Advance = model.advance(state, w.grips.at(k))
+        near = (before.position.abs() < FARTHEST).all(dim=(-1, -2)) & torch.isfinite(step.residual).all(dim=(-1, -2))
+        states.append(before)
+        added.append(step.residual)
+        counts.append(w.seen[k] & (step.predicted.held < 0) & near[:, None])
+        state = step.state
+    path = Path(states, torch.stack(added), torch.stack(counts))
+    if not bool((path.added[path.counts] != 0.0).any()):
+        raise InputError(
+            "the network adds nothing, so there is nothing that it could hide",
+            next_step="Train it longer, or on more data",
+        )
+    return path
+
+
+@torch.no_grad()
+def moments(path: Path, roller: Roller, probes: Probes) -> Moments:
+    """Every probe beside the network, over the states of `path`.
+
+    All episodes times all probes are the worlds of one simulator, so that one kernel serves the whole library.
+    Each step begins in the path's state; a law's own memory is carried from the step before.
+    """
+    sample, twin = roller.sample, roller.twin
+    everything: list[Probe | None] = [None, *probes.rows]
+    candidates = [Candidate(twin.physics, probes.extensions(p)) for p in everything]
+    substeps = max(roller.substeps(candidates), twin.meta.substeps or 1)
+    number, width = len(everything), sample.windows.count
+    simulator = backbone(twin, [c.extensions for c in candidates for _ in range(width)], substeps)
+    groups = tuple(sorted(set(sample.groups.tolist())))
+    group = torch.tensor([groups.index(int(sample.groups[e])) for e in sample.episode.tolist()])
+    products = torch.zeros(len(groups), number, number, dtype=torch.float64)
+    every = max(1, math.ceil(len(path.states) * width / MOST_STATES))
+    shared = _shared_memory(twin)
+    memory: Tensor | None = None
+    for k, state in enumerate(path.states):
+        started, grips = _started(simulator, state, sample.windows.grips.at(k), number, memory)
+        after = simulator.step(started, grips)
+        memory = after.memory["effects"].unflatten(0, (number, width)).clone()
+        memory[:, :, :shared] = memory[:1, :, :shared]
+        if k % every == every - 1:
+            velocity = after.velocity.unflatten(0, (number, width))
+            columns = torch.cat((velocity[1:] - velocity[:1], path.added[k][None]))  # (P + 1, W, N, 3)
+            finite = torch.isfinite(columns).all(dim=0).all(dim=(-1, -2))
+            mask = path.counts[k] & finite[:, None]
+            rows = torch.where(mask[None, ..., None], columns, 0.0).double().movedim(1, 0).flatten(2)
+            products.index_add_(0, group, rows @ rows.mT)
+    taken = path.counts[every - 1 :: every]
+    values = int(taken.sum())
+    speed = math.sqrt(float(products[:, -1, -1].sum()) / max(values, 1))
+    return Moments(np.asarray(products.numpy()), groups, values, speed)
+
+
+def _started(
+    simulator: Dynamics, state: State, grip: Grip, number: int, memory: Tensor | None
+) -> tuple[State, Grip]:
+    """`state` (W, ...) in `number` copies, probe by probe, and the grip at the end of the step."""
+
+    def tiled(values: Tensor) -> Tensor:
+        return values.repeat(number, *[1] * (values.dim() - 1))
+
+    grips = Grip(*(tiled(v) for v in (grip.position, grip.rotation, grip.closed)))
+    kept = {k: tiled(v) for k, v in state.memory.items() if k != "effects"}
+    plain = State(*(tiled(v) for v in (state.position, state.velocity, state.held)))
+    if memory is None:
+        before = Grip(*(kept[f"grip_{k}"] for k in ("position", "rotation", "closed")))
+        effects = simulator.start(plain, before).memory["effects"]
+    else:
+        effects = memory.flatten(0, 1)
+    return plain.replace(memory={**kept, "effects": effects}), grips
+
+
+def _shared_memory(twin: Twin) -> int:
+    """Leading values of `effects` memory that belong to the twin as it is: frames of lines, curvatures, its laws'.
+
+    They are alike in all worlds: a probe acts for one period at a time.
+    """
+    laws = sum(find_effect(e.id).bend_memory for e in twin.extensions)
+    return 4 * len(chains(twin.body)) + (2 + laws) * len(twin.body.bends)

@@ -1,0 +1,85 @@
+"""Which candidate of a round gets a name, and why the others do not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pred_core.diagnose.evidence import Judged, family_wise, rivals, set_limit, simplest
+from pred_core.diagnose.progress import Named, Progress
+
+LEFT = 0.25  # of the floor: an excess that is called unknown if nothing explains it
+FEWEST = 10  # episodes for inference; fewer are exploratory
+SLIGHT = 0.05  # of the mean gain: an episode that loses less is not worse
+EXPLORATORY = 0.5  # share of the excess a cause must close to be named from fewer
+BETTER = 1.1  # times the gain of a simpler law that one with more parameters needs to be its rival
+STANDING = 0.05  # of the floor: a gain below is not worth a name, whatever its significance
+
+
+def choose(
+    judged: Sequence[Judged], excess: float, floor: float, progress: Progress
+) -> tuple[Named | None, list[tuple[Judged, float, str]]]:
+    """(the name, or None; every candidate with its adjusted p value and why it is not named, largest gain first)."""
+    config = progress.bench.config
+    p = family_wise(judged, config.seed, progress.bench.target.roller.sample.groups)
+    rows = [(j, float(q), why_not(j, float(q), excess, floor, progress)) for j, q in zip(judged, p, strict=True)]
+    rows.sort(key=lambda row: -row[0].mean)
+    accepted = [row for row in rows if not row[2]]
+    if not accepted:
+        return None, rows
+    best = max(accepted, key=lambda row: row[0].mean)[0]
+    chosen = simplest([row[0] for row in accepted], best)
+    limit = set_limit(len(chosen.gain))
+    near = [
+        o
+        for o, z in rivals([r[0] for r in accepted], chosen)
+        if o is not chosen and z < limit and not (o.parameters > chosen.parameters and o.mean < BETTER * chosen.mean)
+    ]
+    q = next(row[1] for row in accepted if row[0] is chosen)
+    closed = share_closed(chosen, progress, excess, floor)
+    return Named(chosen, q, tuple(o.trial.id for o in near), closed, len(progress.rounds)), rows
+
+
+def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress) -> str:
+    """Why a candidate is not named; "" if it may be."""
+    config = progress.bench.config
+    cold = progress.bench.reference is None
+    first = progress.rounds[0] if progress.rounds else None
+    whole = excess if first is None or cold else max(float(first.base.mean()) - first.floor, excess)
+    least = max((config.cold_gate if cold else config.gate) * whole, STANDING * floor)
+    better, acting = j.improved
+    if len(j.gain) < FEWEST:  # no inference from so few: what helps everywhere, and much, is named as exploratory
+        worse = int((j.gain[j.acts] < -SLIGHT * j.mean).sum())
+        if acting == 0 or worse:
+            return f"{worse} of {acting} episodes get worse"
+        return "" if j.mean >= max(EXPLORATORY * whole, least) else f"saves too little ({j.mean:.3f} of the loss)"
+    if acting < 4:
+        return f"acts in {acting} episodes only"
+    if p > config.level:
+        return f"not significant (adjusted p {p:.3f})"
+    if j.mean < least:
+        return f"saves too little ({j.mean:.3f} of the loss, {least:.3f} needed)"
+    if better < config.improved * acting:
+        return f"{better} of {acting} episodes improve"
+    if not j.excludes_null:
+        return "its interval includes no change"
+    return ""
+
+
+def share_closed(j: Judged, progress: Progress, excess: float, floor: float) -> float:
+    """Share of the round's excess that is gone with it, 0 to 1."""
+    if excess <= 0.0:
+        return 0.0
+    standing = excess + floor
+    return float(np.clip((standing - float(j.extended.mean())) / excess, 0.0, 1.0))
+
+
+def every_member(j: Judged) -> bool:
+    """Whether each effect of a pair has a switch whose interval leaves out its null."""
+    for id in j.trial.ids:
+        knobs = [j.trial.space.knobs[n].name for n in j.trial.amplitudes]
+        mine = [k for k in knobs if k.startswith(f"{id}.")]
+        if not any(j.intervals[k][0] > j.null[k] or j.intervals[k][1] < j.null[k] for k in mine):
+            return False
+    return True

@@ -1,0 +1,74 @@
+"""What a diagnosis knows between rounds: what was named, what each round saw."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass, field
+
+from pred_core.diagnose.evidence import Judged
+from pred_core.diagnose.journal import Journal
+from pred_core.diagnose.judge import Bench
+from pred_core.twin import Twin
+from pred_core.types import Array
+
+
+@dataclass(frozen=True)
+class Named:
+    """A cause that was accepted."""
+
+    judged: Judged
+    p_adjusted: float
+    group: tuple[str, ...]  # others that these data do not tell apart from it
+    closed: float  # share of the excess of its round that it closes
+    round: int
+
+
+@dataclass(frozen=True)
+class Round:
+    """What a round saw."""
+
+    base: Array  # (E,) losses before it
+    floor: float  # mean loss of the reference, or nothing
+    screened: tuple[tuple[str, float], ...]  # candidate, promise
+    judged: tuple[tuple[Judged, float, str], ...]  # candidate, adjusted p, why it was rejected ("" = accepted)
+
+
+@dataclass
+class Progress:
+    """State of a diagnosis between rounds."""
+
+    bench: Bench
+    journal: Journal
+    twins: list[Twin]  # before anything was named, and after each name
+    deadline: float = math.inf  # [s] of `time.monotonic`
+    named: list[Named] = field(default_factory=list)
+    rounds: list[Round] = field(default_factory=list)
+    unknown: bool = False
+    unknown_p: float = 1.0
+    explained: float | None = None  # share of the motion, in the end; None: the object hardly moves
+    notes: list[str] = field(default_factory=list)
+
+    def add(self, named: Named, bench: Bench) -> None:
+        """Take a name, and the bench that has it."""
+        self.named = [_refitted(n, named.judged) for n in self.named]
+        self.named.append(named)
+        self.bench = bench
+        self.twins.append(bench.twin)
+
+    def late(self) -> bool:
+        """Whether the time is used up."""
+        return time.monotonic() > self.deadline
+
+
+def _refitted(named: Named, later: Judged) -> Named:
+    """An earlier name with the values it has beside a later one: they were fitted together."""
+    j = named.judged
+    mine = set(j.values) & set(later.values)
+    judged = dataclasses.replace(
+        j,
+        values={**j.values, **{k: later.values[k] for k in mine}},
+        intervals={**j.intervals, **{k: later.intervals[k] for k in mine}},
+    )
+    return dataclasses.replace(named, judged=judged)
