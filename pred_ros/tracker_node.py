@@ -126,6 +126,7 @@ class TrackerNode(Shell):
         self._refused = ""
         self._status = "searching"
         self._odd: tuple[str, float] | None = None
+        self._slipped = False
         self._stopping = False
 
     def setup(self) -> None:
@@ -195,6 +196,8 @@ class TrackerNode(Shell):
             self.report(ERROR, f"no pictures of {', '.join(silent)}: nothing is tracked")
         elif self._status != "tracking":
             self.report(WARN, f"{self._status}: the object is not in view, or is not a {self.config.kind}")
+        elif self._slipped:
+            self.report(WARN, "tracking; the object has slipped out of the gripper")
         elif self._odd is not None:
             camera, off = self._odd
             self.report(WARN, f"{camera} sees the object {1e3 * off:.0f} mm off: has it been moved? Calibrate it anew")
@@ -286,7 +289,7 @@ class TrackerNode(Shell):
         t = estimate.tracks
         frame = PointFrame(int(t.stamp), t.position, t.id, t.confidence, None)
         self._out.publish(convert.points_to_cloud(frame))
-        self._odd = estimate.odd_camera()
+        self._odd, self._slipped = estimate.odd_camera(), estimate.slipped
         self.diagnostics.count("estimates")
         self.diagnostics.value("residual [mm]", f"{1e3 * estimate.residual:.2f}")
         self.diagnostics.value("particles in view", f"{int(t.visible.sum())} of {len(t.id)}")

@@ -25,6 +25,7 @@ class Estimate:
     residual: float  # [m] root mean square distance of the points that were used
     cameras: tuple[str, ...]  # whose pictures went in
     off: tuple[float, ...] = ()  # [m] median distance between the object and what each of them sees of it
+    slipped: bool = False  # the object was held when it was found, and is not any more
 
     def odd_camera(self) -> tuple[str, float] | None:
         """The camera that sees the object elsewhere than the others do, and by how much [m]: it has been moved."""

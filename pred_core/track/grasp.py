@@ -68,6 +68,7 @@ class Grasp:
         self.config = config
         self.held: NDArray[np.int64] = np.zeros(0, np.int64)  # (P,) gripper or -1
         self._local: Array = np.zeros((0, 3))
+        self.slipped = False  # what was held is not any more
         self._usual = 0.0  # [m] from the held particles to the nearest point seen, when they were bound
         self._off_since: int | None = None
 
@@ -75,7 +76,7 @@ class Grasp:
         """Hold the particles (P, 3) [m] that are near to closed grippers now, and no others."""
         self.held = np.full(len(position), -1, np.int64)
         self._local = np.zeros_like(position)
-        self._usual, self._off_since = -1.0, None
+        self._usual, self._off_since, self.slipped = -1.0, None, False
         if poses is None:
             return
         for gripper, (place, turn) in enumerate(zip(*poses, strict=True)):
@@ -112,8 +113,9 @@ class Grasp:
         return (stamp - self._off_since) * 1e-9 >= self.config.patience
 
     def release(self) -> None:
-        """Hold nothing."""
+        """The object has slipped out: hold nothing."""
         self.held = np.full_like(self.held, -1)
+        self.slipped = True
 
 
 def _matrices(q: Array) -> Array:

@@ -198,7 +198,9 @@ class LineTracker:
         confidence = trace_confidence(fit.covariance, visible)
         tracks = Tracks(np.int64(self.stamp), fit.nodes.copy(), np.arange(count, dtype=np.uint32), visible, confidence)  # type: ignore[arg-type]
         off = tuple(fit.off.tolist())
-        return Estimate(tracks, fit.covariance, self.velocity.copy(), status, fit.residual, cameras, off)
+        return Estimate(
+            tracks, fit.covariance, self.velocity.copy(), status, fit.residual, cameras, off, self.grasp.slipped
+        )
 
     def _cloud(self, views: Sequence[View], stamp: int, radius: float) -> Cloud:
         """At most `points` of each view, moved from the surface onto the centreline."""

@@ -105,7 +105,7 @@ class Tracker:
         self._views = {c: v for c, v in self._views.items() if v.stamp >= oldest}
         views = [self._views[c] for c in self.cameras if c in self._views]
         if self._searching:
-            if not self._find(views, frames, stamp, poses):
+            if self.blind_to_arm(poses) or not self._find(views, frames, stamp, poses):
                 return None
             views = [self._views[v.camera] for v in views]
         prior = self._prior if self._prior is not None and abs(stamp - self._prior.stamp) * 1e-9 < 0.5 else None
@@ -116,6 +116,10 @@ class Tracker:
         if estimate.status == "lost":
             self._searching = True
         return estimate
+
+    def blind_to_arm(self, poses: tuple[Array, Array] | None) -> bool:
+        """An arm is in view and nobody has said where: it would be taken for the object, and the held end is unknown."""
+        return self.config.arm_radius > 0.0 and (poses is None or not len(self._closed))
 
     @property
     def _stamp(self) -> int:
