@@ -14,6 +14,7 @@ from pred_core.plant.live.arm7 import Arm7
 from pred_core.plant.live.cell import Cell, CellConfig
 from pred_core.plant.live.chain import LIMITS, READY, TOOL_LENGTH, Chain
 from pred_core.plant.live.mover import DOWN, Segment, ToolPose, quaternion_of, rotation_between, tool_down
+from pred_core.plant.live.station import TICK, Station
 
 
 def test_the_zero_pose_is_the_published_one() -> None:
@@ -100,3 +101,18 @@ def test_a_quaternion_helper_pair_is_its_own_inverse() -> None:
         DOWN, Segment(ToolPose(np.zeros(3), DOWN), ToolPose(np.zeros(3), DOWN), 1.0).at(1.0).rotation
     ) == pytest.approx(np.zeros(3))
     assert rotation_between(np.array([1.0, 0, 0, 0]), quaternion_of(turn)) == pytest.approx(turn)
+
+
+def test_the_edge_of_the_reach_latches_a_fault_and_time_goes_on() -> None:
+    station = Station(Cell(cameras=()))
+    start = station.reset(0).truth.gripper
+    station.servo.begin()
+    for _ in range(700):
+        outward = ToolPose(station.cell.reference.position + [0.002, -0.002, 0.001], start.rotation)
+        if station.servo.following:
+            station.servo.command(outward, np.zeros(3), np.zeros(3), station.cell.time)
+        moment = station.tick()
+    assert "out of the arm's reach" in station.servo.fault
+    place = moment.truth.gripper.position
+    assert np.linalg.norm(station.tick().truth.gripper.position - place) < 1e-4, "it stays where it was"
+    assert station.cell.time == pytest.approx(701 * TICK), "no tick is lost"

@@ -74,8 +74,11 @@ class Arm7:
         data.qvel[self._dof] = 0.0
 
     def aim(self, segment: Segment) -> None:
-        """Solve for the end of the segment; in between the joints move evenly."""
-        end = self.chain.inverse(segment.end, self._end)
+        """Solve for the end of the segment; in between the joints move evenly.
+
+        A segment that stays is not solved for: at the edge of the reach the same pose may not be found twice.
+        """
+        end = self._end if segment.stays else self.chain.inverse(segment.end, self._end)
         self._begin, self._end, self._seconds = self._end, end, segment.seconds
 
     def push(self, data: mujoco.MjData, share: float) -> None:

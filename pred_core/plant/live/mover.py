@@ -48,6 +48,12 @@ class Segment:
         """(3,) [rad/s] world."""
         return rotation_between(self.begin.rotation, self.end.rotation) / self.seconds
 
+    @property
+    def stays(self) -> bool:
+        """Begin and end are the same pose, bit for bit."""
+        same = np.array_equal(self.begin.position, self.end.position)
+        return same and np.array_equal(self.begin.rotation, self.end.rotation)
+
     def at(self, share: float) -> ToolPose:
         """The reference after `share` (0 to 1) of the step."""
         position = (1.0 - share) * self.begin.position + share * self.end.position
