@@ -28,6 +28,7 @@ import os
 import shlex
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from pred_core.bag.dataset import Dataset, load_dataset, write_dataset
@@ -126,11 +127,11 @@ def identify(data: Path, twin: Path, flags: list[str]) -> None:
         pred("identify", str(data), "--out", str(twin), *flags)
 
 
-def train(data: Path, twin: Path, out: Path, seed: int, steps: int) -> None:
+def train(data: Path, twin: Path, out: Path, seed: int, steps: int, flags: Sequence[str] = TRAIN) -> None:
     """`pred train`, resumed where it stopped, unless the weights are there."""
     if not (out / "residual.safetensors").exists():
         resume = ["--resume"] if (out / "train.checkpoint.safetensors").exists() else []
-        settings = [] if resume else [*TRAIN, "--steps", str(steps), "--seed", str(seed)]
+        settings = [] if resume else [*flags, "--steps", str(steps), "--seed", str(seed)]
         pred("train", str(data), "--twin", str(twin), "--out", str(out), *resume, *settings)
 
 

@@ -36,9 +36,8 @@ class Path:
 
 @dataclass(frozen=True)
 class Moments:
-    """Sums of products over all that counts, for least squares: column p < P a probe's velocity, the last the network's.
-
-    A probe's velocity is what one period adds with it, minus without.
+    """Sums of products over all that counts, for least squares: column p < P is a probe's velocity, the last the
+    network's. A probe's velocity is what one period adds with it, minus without.
     """
 
     products: Array  # (G, P + 1, P + 1) [m^2/s^2]
@@ -47,7 +46,9 @@ class Moments:
     speed: float  # [m/s] root mean square of the network's velocity a particle
 
 
-def backbone(twin: Twin, extensions: list[tuple[Extension, ...]] | tuple[Extension, ...], substeps: int) -> SpringMass:
+def backbone(
+    twin: Twin, extensions: list[tuple[Extension, ...]] | tuple[Extension, ...], substeps: int | None
+) -> SpringMass:
     """The twin's simulator with other effects; a world that diverges becomes NaN and leaves the others alone."""
     return SpringMass(
         twin.body, twin.physics, twin.scene, period=twin.meta.period, substeps=substeps, extensions=extensions,
@@ -130,7 +131,7 @@ def _started(
 
     grips = Grip(*(tiled(v) for v in (grip.position, grip.rotation, grip.closed)))
     kept = {k: tiled(v) for k, v in state.memory.items() if k != "effects"}
-    plain = State(*(tiled(v) for v in (state.position, state.velocity, state.held)))
+    plain = State(tiled(state.position), tiled(state.velocity), tiled(state.held))
     if memory is None:
         before = Grip(*(kept[f"grip_{k}"] for k in ("position", "rotation", "closed")))
         effects = simulator.start(plain, before).memory["effects"]

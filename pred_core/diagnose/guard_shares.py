@@ -7,7 +7,7 @@ with a random sign for every recording, so that a law that holds in one does not
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,7 @@ FLIPS = 256
 DRAWS = 2000
 MOST_FOLDS = 12
 RIDGE = 1e-3  # of a column's own square: breaks ties of columns that are alike
-QUIET = 1e-4  # of the largest share of a column's usual size: below, the motions do not excite it
+QUIET = 1e-6  # [m/s] a column's usual size: below, the motions do not excite it
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,10 @@ def shares(m: Moments, probes: Sequence[Probe], rng: np.random.Generator) -> tup
     errors = {f: cross_fitted(m.products, model, flips) for f, model in models.items()}  # (F, G)
     explained = {f: 1.0 - e.sum(axis=1) / squares.sum() for f, e in errors.items()}
     highest = np.max(list(explained.values()), axis=0)
-    together = _all(models.values())
-    joint = _alone(m, together)
+    joint = _alone(m, _all(models.values()))
     draws = rng.integers(0, len(squares), (DRAWS, len(squares)))
     rows = []
-    for f, model in models.items():
+    for f in models:
         spread = 1.0 - errors[f][0][draws].sum(axis=1) / squares[draws].sum(axis=1)
         low, high = np.quantile(spread, (0.025, 0.975))
         p = float((highest >= explained[f][0] - 1e-12).mean())
@@ -100,7 +99,7 @@ def cross_fitted(products: Array, model: Model, flips: Array) -> Array:
         chosen = _chosen(whole, b, model)
         for columns in set(chosen):
             rows = np.array([n for n, c in enumerate(chosen) if c == columns])
-            c = list(columns)
+            c = np.array(columns, dtype=np.int64)
             beta = _solved(whole[np.ix_(c, c)], b[np.ix_(rows, c)])
             for g in fold.tolist():
                 fitted = np.einsum("fp,pq,fq->f", beta, gram[g][np.ix_(c, c)], beta)
@@ -133,13 +132,14 @@ def _alone(m: Moments, model: Model) -> float:
     return 1.0 - float(error.sum() / m.products[:, -1, -1].sum())
 
 
-def _all(models: object) -> Model:
-    rows = list(models)  # type: ignore[call-overload]
+def _all(models: Iterable[Model]) -> Model:
+    rows = list(models)
     return Model(tuple(c for r in rows for c in r.fixed), tuple(p for r in rows for p in r.places))
 
 
 def _model(probes: Sequence[Probe], excited: Array, family: str = "", effect: str = "") -> Model:
-    fixed, places = [], {}
+    fixed: list[int] = []
+    places: dict[str, list[int]] = {}
     for n, p in enumerate(probes):
         if not excited[n] or (family and p.family != family) or (effect and p.effect != effect):
             continue
@@ -152,8 +152,7 @@ def _model(probes: Sequence[Probe], excited: Array, family: str = "", effect: st
 
 def _excited(m: Moments) -> Array:
     """(P,) bool: columns that act at all, beyond what single precision leaves."""
-    size = np.sqrt(np.einsum("gpp->gp", m.products).sum(axis=0)[:-1] / max(m.values, 1))
-    return np.asarray(size > QUIET * np.median(size[size > 0.0], initial=0.0))
+    return np.asarray(np.sqrt(np.einsum("gpp->gp", m.products).sum(axis=0)[:-1] / max(m.values, 1)) > QUIET)
 
 
 def _flips(groups: int, rng: np.random.Generator) -> Array:
