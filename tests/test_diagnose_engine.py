@@ -20,6 +20,7 @@ from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals
 from pred_core.diagnose.fit import Fit, fit, rho, without_groups
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Bench, judge, screen
+from pred_core.diagnose.naming import exploratory, one_recording, why_not
 from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.rounds import finish
@@ -412,6 +413,24 @@ def test_a_base_that_predicts_nothing_is_never_good_enough(
 def test_what_hardly_moves_says_nothing_of_a_twin(twin: Twin) -> None:
     still = recorded(twin, (), ("train",), frames=20, size=0.0)
     assert skill_of(twin, Roller(twin, make_sample(still, twin, 0.3)), 2) is None
+
+
+def test_one_recording_is_exploratory_and_says_so(twin: Twin) -> None:
+    """Twelve episodes of one recording: no interval leaves out "no change", because nothing can be left out. What helps
+    everywhere is named all the same, labelled; with two recordings it is not, as its interval is all that is allowed.
+    """
+    splits = ("train",) * 9 + ("test",) * 3
+    twelve = recorded(twin, drag(), splits, frames=16)
+    for recordings, said in ((1, "all train episodes (9) are of one recording: exploratory, because"), (2, "")):
+        cut = [dataclasses.replace(e, recording=n % recordings) for n, e in enumerate(twelve)]
+        journal = Journal(None, {})
+        journal.known["base"] = values_of(twin)
+        bench = commission(twin, cut, [], SMALL, quiet, journal)
+        why = one_recording(bench)
+        assert why.startswith(said) and ("dataset.yaml" in why) == exploratory(bench) == bool(said)
+        wide = judged(twin, "drag_linear", 1.5, 10.0, [1.0] * 12)  # the interval holds 0
+        reason = why_not(wide, 0.001, 1.5, 0.0, Progress(bench, journal, [twin]))
+        assert reason == ("" if said else "its interval includes no change")
 
 
 # The whole ------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from pred_core.diagnose.causes import causes_of, evidence_of
 from pred_core.diagnose.errors import EpisodeErrors, episode_errors, gain_of
 from pred_core.diagnose.gate import GateResult
 from pred_core.diagnose.judge import Bench, Tell
-from pred_core.diagnose.naming import FEWEST
+from pred_core.diagnose.naming import exploratory, one_recording
 from pred_core.diagnose.next_motion import propose
 from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.ranking import ranking
@@ -47,7 +47,6 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
     tell(f"errors on the {split} episodes")
     errors = _errors(study, progress, split)
     ood = _errors(study, progress, "ood") if any(e.split == "ood" for e in study.corrected) else None
-    few = len([e for e in study.corrected if e.split != "ood"]) < FEWEST
     result = Diagnosis(
         outcome=_outcome(causes, progress),
         sentence="",
@@ -59,7 +58,7 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         not_identifiable=tuple(not_identifiable(progress, study.corrected)),
         not_testable=_not_testable(study.gate, progress),
         next_motion=None,
-        exploratory=few,
+        exploratory=exploratory(study.bench),
         notes=_notes(study, progress, errors, ood),
         gate=study.gate,
         rounds=tuple(progress.rounds),
@@ -150,6 +149,8 @@ def _not_testable(gate: GateResult, progress: Progress) -> Mapping[str, str]:
 
 def _notes(study: Study, progress: Progress, errors: Errors, ood: Errors | None) -> tuple[str, ...]:
     rows = [*study.gate.notes, *progress.notes]
+    if why := one_recording(study.bench):
+        rows.append(why)
     for e in (errors, ood):
         for title, side in () if e is None else (("base", e.base), ("extended", e.extended)):
             if side.diverged:

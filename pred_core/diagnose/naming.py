@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pred_core.diagnose.evidence import Judged, family_wise, rivals, set_limit, simplest
+from pred_core.diagnose.evidence import FEWEST_GROUPS, Judged, family_wise, rivals, set_limit, simplest
+from pred_core.diagnose.judge import Bench
 from pred_core.diagnose.progress import Named, Progress
 
 LEFT = 0.25  # of the floor: an excess that is called unknown if nothing explains it
@@ -15,6 +16,22 @@ SLIGHT = 0.05  # of the mean gain: an episode that loses less is not worse
 EXPLORATORY = 0.5  # share of the excess a cause must close to be named from fewer
 BETTER = 1.1  # times the gain of a simpler law that one with more parameters needs to be its rival
 STANDING = 0.05  # of the floor: a gain below is not worth a name, whatever its significance
+
+
+def exploratory(bench: Bench) -> bool:
+    """These data allow no inference."""
+    return bench.target.roller.sample.episodes < FEWEST or bool(one_recording(bench))
+
+
+def one_recording(bench: Bench) -> str:
+    """What to do about train episodes that are all of one recording; "" if they are not."""
+    if len(set(bench.target.roller.sample.groups[bench.train].tolist())) > 1:
+        return ""
+    return (
+        f"all train episodes ({int(bench.train.sum())}) are of one recording: exploratory, because no parameter was fitted "
+        "without the recording it is judged on, so there is neither an interval nor a cross-fit; record two or more, "
+        f"better {FEWEST_GROUPS}, each begun anew, and give each its number under 'recording' in dataset.yaml"
+    )
 
 
 def choose(
@@ -49,7 +66,7 @@ def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress
     whole = excess if first is None or cold else max(float(first.base.mean()) - first.floor, excess)
     least = max((config.cold_gate if cold else config.gate) * whole, STANDING * floor)
     better, acting = j.improved
-    if len(j.gain) < FEWEST:  # no inference from so few: what helps everywhere, and much, is named as exploratory
+    if exploratory(progress.bench):  # no inference: what helps everywhere, and much, is named as exploratory
         worse = int((j.gain[j.acts] < -SLIGHT * j.mean).sum())
         if acting == 0 or worse:
             return f"{worse} of {acting} episodes get worse"

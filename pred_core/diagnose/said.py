@@ -62,7 +62,7 @@ def sentence(d: Diagnosis) -> str:
         f"the {held} falls from {e.base.mean:.1f} to {e.extended.mean:.1f} mm, "
         f"{e.gain.improved} of {e.gain.episodes} episodes"
     )
-    label = "Exploratory, too few episodes for a firm answer: " if d.exploratory else ""
+    label = "Exploratory, too few episodes or recordings for a firm answer: " if d.exploratory else ""
     if d.outcome == "none":
         return f"{label}Nothing is found that your simulation lacks: its {held} is {e.base.mean:.1f} mm."
     if d.outcome == "unknown" and _no_base(d):
