@@ -313,6 +313,20 @@ def test_what_a_law_remembers_is_carried_over_restarts(twin: Twin) -> None:
     assert float(forgot.abs().max()) > 20.0 * float(carried.abs().max())
 
 
+def test_a_slide_is_counted_once(twin: Twin) -> None:
+    """The rope slides out by centimetres in 1.3 s. Each window starts from a measured rope that has slid already, so a
+    slide begins anew there, also beside creep that is off, for whose sake memory is carried from window to window.
+    """
+    stiff, _ = remembering(twin)
+    slip = (find_effect("grip_slip").extension(weakness=(5.0,)),)
+    both = (*slip, find_effect("bending_creep").extension())
+    episodes = recorded(stiff, slip, ("train",) * 2, frames=40, size=0.15)
+    roller = Roller(stiff, make_sample(episodes, stiff, 0.3))
+    fixed, alone, beside = (roller.errors([Candidate(stiff.physics, e)])[0] for e in ((), slip, both))
+    assert float(fixed.abs().max()) > 0.01  # it does slide
+    assert float((alone - beside).abs().max()) < 1e-4
+
+
 def test_what_is_known_to_misfit_adds_its_variance(twin: Twin, reference: list[Episode]) -> None:
     """1 / w^2 is a variance: with a misfit of (2 mm)^2 it is 4e-6 m^2 larger, and never below the noise's own."""
     sample = make_sample(reference[:2], twin, 0.3)

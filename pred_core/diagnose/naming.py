@@ -28,9 +28,9 @@ def one_recording(bench: Bench) -> str:
     if len(set(bench.target.roller.sample.groups[bench.train].tolist())) > 1:
         return ""
     return (
-        f"all train episodes ({int(bench.train.sum())}) are of one recording: exploratory, because no parameter was fitted "
-        "without the recording it is judged on, so there is neither an interval nor a cross-fit; record two or more, "
-        f"better {FEWEST_GROUPS}, each begun anew, and give each its number under 'recording' in dataset.yaml"
+        f"all train episodes ({int(bench.train.sum())}) are of one recording: exploratory, because no parameter was "
+        "fitted without the recording it is judged on, so there is neither an interval nor a cross-fit; record two or "
+        f"more, better {FEWEST_GROUPS}, each begun anew, and give each its number under 'recording' in dataset.yaml"
     )
 
 

@@ -82,7 +82,7 @@ class Roller:
     def _errors(self, candidates: Sequence[Candidate], substeps: int) -> Tensor:
         """(K, C, W, N, 3), windows in the sample's order."""
         effects = [find_effect(e.id) for e in candidates[0].extensions]
-        remembers = any(e.bend_memory for e in effects)  # a slide in the jaws begins anew: its lever is measured
+        remembers = any(e.bend_memory for e in effects)
         orders = int(self.sample.order.max()) + 1 if remembers else 1
         result: Tensor | None = None
         memory: dict[int, Tensor] = {}  # episode -> (C, M + 1) what the laws remember, and steps
@@ -127,6 +127,8 @@ class Roller:
             fresh = torch.cat((carried["effects"], carried["steps"][:, None]), dim=1).unflatten(0, (count, width))
             columns = [fresh[:, n] if k is None else torch.where(k.isfinite(), k, 0.0) for n, k in enumerate(known)]
             both = torch.stack(columns, dim=1).flatten(0, 1)
+            slides = simulator.grip_memory_size
+            both[:, both.shape[1] - 1 - slides : -1] = 0.0  # begins anew: the measured start has what slid before
             carried["effects"], carried["steps"] = both[:, :-1].contiguous(), both[:, -1].contiguous()
         carried["time"] = _tile(self.sample.time[rows], count) - carried["steps"] * twin.meta.period
         p = w.grips

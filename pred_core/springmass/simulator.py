@@ -23,6 +23,7 @@ from pred_core.types import Body, Grip, Physics, Scene, State
 
 _KEPT_WORKSPACES = 8
 _KEPT_BYTES = 1 << 28  # of buffers between calls; one call may need more
+_NO_TURN = 3.0  # [rad] a twist below it is found again from the ends alone; beyond pi it would lose a turn
 
 
 class SpringMass:
@@ -76,11 +77,17 @@ class SpringMass:
         slots = 2 + sum(e.bend_memory for e in self.effects)
         # Per line the twist angle and a director, per bend two curvatures and what `bend` hooks keep.
         frame_size = 4 * len(self._lines) + slots * len(body.bends) if framed else 0
+        self._twists = slice(0, 4 * len(self._lines) if framed else 0, 4)
         self._grip_size = body.count * sum(e.grip_memory for e in self.effects)  # at the end: per slot and particle
         self._memory_size = frame_size + self._grip_size
         self._bends = len(body.bends) if framed or any(p.bending_stiffness != 0.0 for p in self.physics) else 0
         self._constants: dict[tuple[int, int], dict[str, Tensor]] = {}
         self._workspaces: dict[Size, tuple[Workspace, Tensor, Tensor]] = {}
+
+    @property
+    def grip_memory_size(self) -> int:
+        """Values at the end of a world's effect memory that say how far held particles have moved in their grippers."""
+        return self._grip_size
 
     def start(self, state: State, grip: Grip | None = None) -> State:
         """Fill in grip offsets, the pose they refer to, effect memory and the clock. See `Dynamics.start`.
@@ -114,6 +121,19 @@ class SpringMass:
         after, _ = self._advance(flat, Grip(poses.position[None], poses.rotation[None], poses.closed[None]), False)
         position = self._check(after.position[None])[0]
         return _unflatten(after.replace(position=position), lead)
+
+    def corrected(self, state: State, position: Tensor, velocity: Tensor) -> State:
+        """See `Correctable`: bends take their new shape as it is, as at a start, and the clock goes on.
+
+        A bend's damping would else see the whole correction in one substep. Where the frame cannot be found again
+        (nothing is held, or an end was turned by more than half a turn), it is kept, and damps the correction.
+        """
+        memory = dict(state.memory)
+        twists = memory["effects"][..., self._twists]
+        if twists.numel() and bool((state.held >= 0).any()) and float(twists.abs().max()) < _NO_TURN:
+            memory["time"] = memory["time"] + memory["steps"] * self.period
+            memory["steps"] = torch.zeros_like(memory["steps"])
+        return state.replace(position=position, velocity=velocity, memory=memory)
 
     def rollout(self, state: State, grips: Grip) -> Tensor:
         """Positions (T, ..., N, 3) over T periods in one kernel call. See `Dynamics.rollout`."""
