@@ -118,7 +118,7 @@ class Tracker:
         return estimate
 
     def blind_to_arm(self, poses: tuple[Array, Array] | None) -> bool:
-        """An arm is in view and nobody has said where: it would be taken for the object, and the held end is unknown."""
+        """An arm is in view and nobody has said where: it would be taken for the object."""
         return self.config.arm_radius > 0.0 and (poses is None or not len(self._closed))
 
     @property
