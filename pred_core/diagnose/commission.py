@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.fit import Target, fit
-from pred_core.diagnose.journal import Journal
+from pred_core.diagnose.journal import Journal, vector
 from pred_core.diagnose.judge import Bench, Tell
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.sample import Sample, make_sample
@@ -67,7 +67,10 @@ def commission(
     if not use.any():  # a reference of test episodes alone
         use[:] = True
     _check(Roller(twin, judged_on), judged_on, twin)
-    twin = with_stored(twin, journal.once("base", lambda: values_of(_polish(twin, judged_on, use, config, tell))))
+    given = twin
+    twin = journal.piece(
+        "base", lambda: values_of(_polish(given, judged_on, use, config, tell)), lambda v: with_stored(given, v)
+    )
     roller = Roller(twin, judged_on)
     as_it_is = Candidate(twin.physics, twin.extensions)
     plain = _weigh(roller, as_it_is, config, None)
@@ -108,11 +111,13 @@ def values_of(twin: Twin) -> dict[str, Any]:
 
 
 def with_stored(twin: Twin, values: dict[str, Any]) -> Twin:
-    """The twin at stored values."""
+    """The twin at stored values. Raises: KeyError, TypeError or ValueError if they are not of this twin."""
     extensions = tuple(
-        dataclasses.replace(e, parameters={k: tuple(v) for k, v in found.items()})
+        dataclasses.replace(e, parameters={k: tuple(found[k]) for k in e.parameters})
         for e, found in zip(twin.extensions, values["extensions"], strict=True)
     )
+    numbers = [*values["physics"].values(), *(v for e in extensions for row in e.parameters.values() for v in row)]
+    vector(numbers, len(numbers))
     return twin.replace(physics=Physics(**values["physics"]), extensions=extensions)
 
 

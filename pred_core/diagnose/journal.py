@@ -5,9 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from pred_core.errors import ConfigError
+from pred_core.types import Array
+
+T = TypeVar("T")
 
 
 class Journal:
@@ -55,3 +60,25 @@ class Journal:
             with self.path.open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps({"key": key, "value": value}) + "\n")
         return value
+
+    def piece(self, key: str, make: Callable[[], Any], read: Callable[[Any], T]) -> T:
+        """What `read` makes of a piece. Raises: ConfigError if a stored value is not one that `read` knows."""
+        stored = key in self.known
+        value = self.once(key, make)
+        if not stored:
+            return read(value)
+        try:
+            return read(value)
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+            raise ConfigError(
+                f"{self.path}: the value of '{key}' is damaged", got=f"{type(error).__name__}: {error}",
+                next_step="Delete the file to begin anew",
+            ) from error  # fmt: skip
+
+
+def vector(values: Any, size: int) -> Array:
+    """Plain numbers as (size,). Raises: ValueError if they are not as many, or not finite."""
+    found = np.array(values, dtype=np.float64)
+    if found.shape != (size,) or not np.isfinite(found).all():
+        raise ValueError(f"{found.shape} values, expected {size} finite ones")
+    return found

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import ACTS, Judged
 from pred_core.diagnose.fit import Target, fit, rho, without_groups
-from pred_core.diagnose.journal import Journal
+from pred_core.diagnose.journal import Journal, vector
 from pred_core.diagnose.search import Start, starts
 from pred_core.diagnose.trial import Trial, make_trial, scanned
 from pred_core.effects.effect import Effect
@@ -78,8 +79,11 @@ def screen(bench: Bench, effects: Effects, rng: np.random.Generator, journal: Jo
         found = starts(bench.fitted, trial, bench.config.places, rng)[:KEPT_STARTS]
         return [[s.z.tolist(), s.promise] for s in found]
 
-    found = [Start(np.array(z), float(p)) for z, p in journal.once(key, find)]
-    return Screened(effects, trial, found, found[0].promise, trial.space.start())
+    def read(rows: Any) -> Screened:
+        found = [Start(vector(z, len(trial.space.knobs)), float(p)) for z, p in rows]
+        return Screened(effects, trial, found, found[0].promise, trial.space.start())
+
+    return journal.piece(key, find, read)
 
 
 def quick(bench: Bench, screened: Screened, journal: Journal, key: str) -> tuple[Array, float]:
@@ -96,8 +100,8 @@ def quick(bench: Bench, screened: Screened, journal: Journal, key: str) -> tuple
             best = fit(bench.fitted, screened.trial.space, best.z, QUICK)
         return [best.z.tolist(), float(best.loss.mean())]
 
-    z, loss = journal.once(key, find)
-    return np.array(z), float(loss)
+    size = len(screened.trial.space.knobs)
+    return journal.piece(key, find, lambda found: (vector(found[0], size), float(found[1])))
 
 
 def null_of(bench: Bench, screened: Screened, found: Array) -> Array:
@@ -147,17 +151,21 @@ def _like(source: Trial, target: Trial, z: Array) -> Array:
 
 def judge(bench: Bench, screened: Screened, journal: Journal, key: str) -> Judged:
     """Fit on the train episodes, cross-fit by recordings, compare with no change on every episode."""
-    values = journal.once(key, lambda: _judge(bench, screened))
-    trial, space = screened.trial, screened.trial.space
-    z = np.array(values["z"])
+    episodes = bench.target.roller.sample.episodes
+    return journal.piece(key, lambda: _judge(bench, screened), lambda v: _judged(screened.trial, episodes, v))
+
+
+def _judged(trial: Trial, episodes: int, values: Mapping[str, Any]) -> Judged:
+    size = len(trial.space.knobs)
+    z, null = vector(values["z"], size), vector(values["null"], size)
     return Judged(
         trial=trial,
-        values=space.values(z),
-        null=space.values(np.array(values["null"])),
-        intervals=_intervals(trial, z, np.array(values["null"]), np.array(values["left_out"])),
-        gain=np.array(values["gain"]),
-        acts=np.array(values["moved"]) > ACTS,
-        extended=np.array(values["extended"]),
+        values=trial.space.values(z),
+        null=trial.space.values(null),
+        intervals=_intervals(trial, z, null, np.stack([vector(p, size) for p in values["left_out"]])),
+        gain=vector(values["gain"], episodes),
+        acts=vector(values["moved"], episodes) > ACTS,
+        extended=vector(values["extended"], episodes),
         z=z,
     )
 

@@ -68,17 +68,20 @@ def question(bench: Bench, journal: Journal, tell: Tell) -> tuple[Bench, Judged,
             rows.append([int(group), values_of(own)])
         return {"twin": values_of(twin), "without": rows}
 
-    stored = journal.once("structure", fit_chain)
-    twin = with_stored(slim, stored["twin"])
+    twin, without = journal.piece(
+        "structure",
+        fit_chain,
+        lambda v: (with_stored(slim, v["twin"]), [(int(g), with_stored(slim, own)) for g, own in v["without"]]),
+    )
     base = _losses(before, target)
     extended = _losses(twin, target)
-    for group, values in stored["without"] if bench.config.cross_fit else ():
+    for group, own in without if bench.config.cross_fit else ():
         mine = target.roller.sample.groups == group
         if mine.any():
-            extended[mine] = _losses(with_stored(slim, values), target)[mine]
+            extended[mine] = _losses(own, target)[mine]
     trial = _trial(twin)
     knobs = trial.space.knobs
-    spread = [with_stored(slim, v).physics.bending_stiffness for _, v in stored["without"]]
+    spread = [own.physics.bending_stiffness for _, own in without]
     width = 1.645 * float(np.std(spread)) * max(len(spread) - 1, 1) ** 0.5
     value = twin.physics.bending_stiffness
     judged = Judged(
