@@ -40,6 +40,22 @@ class Dynamics(Protocol):
         """
 
 
+@runtime_checkable
+class Correctable(Protocol):
+    """A Dynamics whose memory depends on where the particles were: a measurement that moves them is no motion."""
+
+    def corrected(self, state: State, position: Tensor, velocity: Tensor) -> State:
+        """`state` with other positions and velocities (..., N, 3), and a memory that takes them as they are."""
+
+
+def corrected(dynamics: Dynamics, state: State, position: Tensor, velocity: Tensor) -> State:
+    """`state` at the same time, but there, as `dynamics` can go on from it; held particles keep their place in the
+    gripper."""
+    if isinstance(dynamics, Correctable):
+        return dynamics.corrected(state, position, velocity)
+    return state.replace(position=position, velocity=velocity)
+
+
 def rollout_by_steps(dynamics: Dynamics, state: State, grips: Grip) -> Tensor:
     """The plain `rollout`: one `step` a period. Used by Dynamics that have nothing faster."""
     positions = []

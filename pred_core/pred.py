@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pred_core.dynamics import Dynamics, rollout_by_steps
+from pred_core.dynamics import Dynamics, corrected, rollout_by_steps
 from pred_core.errors import DivergenceError, InputError
 from pred_core.residual.encoder import shuffled_orders
 from pred_core.residual.network import Buffer, Motion, ResidualNetwork, load_network
@@ -79,6 +79,14 @@ class PReD:
     def step(self, state: State, grip: Grip) -> State:
         """The state one period later. Raises: InputError if `start` did not make its memory."""
         return self.advance(state, grip).state
+
+    def corrected(self, state: State, position: Tensor, velocity: Tensor) -> State:
+        """See `Correctable`: the frame before moves along, so that the network sees no jump."""
+        base = corrected(self.base, self.base_state(state), position, velocity)
+        memory = dict(state.memory) | _prefixed(base.memory)
+        memory[PAST_POSITION] = memory[PAST_POSITION] + (position - state.position)
+        memory[PAST_VELOCITY] = memory[PAST_VELOCITY] + (velocity - state.velocity)
+        return base.replace(memory=memory)
 
     @torch.no_grad()
     def rollout(self, state: State, grips: Grip) -> Tensor:

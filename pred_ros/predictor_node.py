@@ -1,7 +1,8 @@
 """The predictor: loads a twin, takes tracker/points and the measured gripper, publishes what comes next.
 
 In: tracker/points, gripper/pose, gripper/closed. Out: state/points (at the newest pose), prediction/points
-(`horizon` later). `~/reset` (Trigger) starts anew from the next tracker frames.
+(`horizon` later). `~/reset` (Trigger) starts anew from the next tracker frames. `mode`: the model alone from a measured
+start (what the offline evaluation does), or an estimate that the tracks correct all the time (what a robot needs).
 """
 
 from __future__ import annotations
@@ -25,10 +26,13 @@ from std_srvs.srv import Trigger
 from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, PREDICTION_POINTS, STATE_POINTS, TRACKER_POINTS
-from pred_core.config import setting
+from pred_core.config import setting, to_mapping
 from pred_core.dynamics import Dynamics
 from pred_core.errors import ConfigError, DivergenceError, PredError, TwinError
-from pred_core.live.prediction import Predictor, Rules
+from pred_core.estimate.config import EstimatorConfig
+from pred_core.live.following import Follower
+from pred_core.live.prediction import Predictor
+from pred_core.live.prediction_records import Rules
 from pred_core.twin import Twin
 from pred_ros import convert, qos, shell
 from pred_ros.diagnostics import ERROR, OK, WARN
@@ -47,7 +51,13 @@ class PredictorConfig:
     twin: str = setting("", doc="folder of the twin")
     held: str = setting("", doc="particle:gripper pairs, e.g. '0:0 1:1'; empty: the twin's, else by distance")
     horizon: float = setting(0.0, unit="s", low=0.0, high=5.0, doc="predicted beyond the newest gripper pose")
-    correct: str = setting("none", choices=("none", "tracks"), doc="open loop, or restart from every measured frame")
+    mode: str = setting("open_loop", choices=("open_loop", "estimate"), doc="model alone, or corrected by the tracks")
+    correct: str = setting("none", choices=("none", "tracks"), doc="in open loop: restart from every measured frame")
+    noise: float = setting(0.001, unit="m", low=1e-6, high=0.1, doc="of a track at confidence 1; estimate only")
+    push: float = setting(
+        0.6, unit="m/s^2", low=0.0, high=100.0, doc="what the model gets wrong; more follows the tracks closer"
+    )
+    stop_after: float = setting(2.0, unit="s", low=0.01, high=600.0, doc="without tracks; then no state is published")
     max_gap: float = setting(
         0.1, unit="s", low=0.001, high=10.0, doc="longest hole in gripper/pose; beyond it, no prediction"
     )
@@ -70,6 +80,13 @@ def parse_held(text: str) -> dict[int, int] | None:
     if any(p < 0 or g < 0 for p, g in held.items()):
         raise ConfigError("parameter 'held'", got=repr(text), allowed="ids and gripper indices of 0 or more")
     return held or None
+
+
+def check(config: PredictorConfig) -> None:
+    """Raise ConfigError for what does not go together."""
+    parse_held(config.held)
+    if config.mode == "estimate" and config.correct != "none":
+        raise ConfigError("parameter 'correct'", got=repr(config.correct), allowed="none where mode is estimate")
 
 
 def load_dynamics_of(twin: Twin) -> Dynamics:
@@ -103,6 +120,7 @@ class PredictorNode(Shell):
             raise TwinError(
                 "parameter 'twin' is empty", next_step="ros2 run pred_ros predictor --ros-args -p twin:=FOLDER"
             )
+        check(config)
         torch.set_num_threads(config.threads)
         self._twin = Twin.load(Path(config.twin))
         self._ids = self._twin.body.id
@@ -123,7 +141,15 @@ class PredictorNode(Shell):
         """Begin: a fresh Predictor, a worker, and subscriptions once enough readers listen."""
         config: PredictorConfig = self.config
         rules = Rules(max_gap=config.max_gap, horizon=config.horizon, correct=config.correct)
-        self._predictor = Predictor(self._dynamics, self._ids, self._held, rules, self._twin.calibration)
+        self._predictor: Predictor | Follower
+        if config.mode == "estimate":
+            trust = EstimatorConfig(noise=config.noise, push=config.push, stop_after=config.stop_after)
+            self._predictor = Follower(
+                self._dynamics, self._twin.body, self._held, rules, self._twin.calibration, trust,
+                dict(self._twin.meta.levers),
+            )  # fmt: skip
+        else:
+            self._predictor = Predictor(self._dynamics, self._ids, self._held, rules, self._twin.calibration)
         self._inbox = queue.SimpleQueue()
         self._stopping = False
         self._worker = self._pool.submit(self._work)
@@ -148,9 +174,8 @@ class PredictorNode(Shell):
 
     def changed(self, config: PredictorConfig) -> None:
         """Everything but the thresholds is fixed while the node runs."""
-        parse_held(config.held)
-        names = ("twin", "held", "horizon", "correct", "max_gap", "overload", "wait_for", "threads", "autostart")
-        fixed = [n for n in names if getattr(config, n) != getattr(self.config, n)]
+        check(config)
+        fixed = [n for n in to_mapping(config) if n != "max_backlog" and getattr(config, n) != getattr(self.config, n)]
         if fixed and self._worker is not None:
             raise ConfigError(
                 f"'{fixed[0]}' cannot change while the node is active", next_step="Deactivate the node first"
@@ -160,9 +185,9 @@ class PredictorNode(Shell):
         """Judge ages and counters."""
         if self._worker is None:
             return
-        counts = self._predictor.counts
         for name in COUNTS_SHOWN:
-            self.diagnostics.value(name, str(getattr(counts, name)))
+            self.diagnostics.value(name, str(getattr(self._predictor.counts, name)))
+        trouble = self._show_condition()
         self.diagnostics.value("waiting inbox", str(self._inbox.qsize()))
         age, frame_age = self.diagnostics.age(GRIPPER_POSE), self.diagnostics.age(TRACKER_POINTS)
         refused_age = self.diagnostics.age("refused message")
@@ -182,16 +207,21 @@ class PredictorNode(Shell):
         elif self._closed is None:
             self.report(ERROR, f"{GRIPPER_CLOSED} never came: no prediction")
         elif not self._predictor.running:
-            missing = counts.waiting_for
-            detail = "no complete pair of frames yet"
-            if missing:
-                detail = f"particles {missing[:5]} are not seen"
-            elif counts.spacing != 1.0:
-                period = self._dynamics.period
-                detail = f"frames come {counts.spacing * period:.4g} s apart, the twin steps {period:g} s"
-            self.report(WARN, f"waiting for a start: {detail}")
+            self.report(WARN, f"waiting for a start: {self._predictor.waiting()}")
         else:
-            self.report(OK, "predicting")
+            self.report(*trouble)
+
+    def _show_condition(self) -> tuple[bytes, str]:
+        """Level and line of a run that goes on; an estimate may stand on the model alone, or have been lost."""
+        if not isinstance(self._predictor, Follower):
+            return OK, "predicting"
+        now = self._predictor.condition()
+        for name, text in now.shown().items():
+            self.diagnostics.value(name, text)
+        trouble = now.trouble()
+        if not trouble:
+            return OK, "following the tracks"
+        return ERROR if now.level == "stopped" else WARN, trouble
 
     def _subscribe_when_heard(self) -> None:
         if self._inputs or self._prediction_out.get_subscription_count() < self.config.wait_for:

@@ -14,7 +14,7 @@ LEVEL = {
     **dict.fromkeys(("types", "dynamics", "calibration", "twin"), 1),
     **dict.fromkeys(("springmass", "effects", "residual", "track", "render", "arm", "metrics", "bag", "report"), 2),
     **dict.fromkeys(("pred", "baselines"), 3),
-    **dict.fromkeys(("identify", "train", "diagnose", "plan", "evaluate", "live"), 4),
+    **dict.fromkeys(("identify", "train", "diagnose", "plan", "evaluate", "estimate", "live"), 4),
     "cli": 5,
 }
 PLANT_MAY_IMPORT = {"plant", "types", "bag", "frames", "config", "errors"}

@@ -10,10 +10,11 @@ from live_world import CLOSED, COUNT, START, STEP, Straight, points, pose
 from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
 from pred_core.errors import InputError, TwinError
-from pred_core.live import prediction
+from pred_core.live import run
 from pred_core.live.laps import AHEAD, Laps
 from pred_core.live.marks import EpisodeMark
-from pred_core.live.prediction import Predictor, Rules
+from pred_core.live.prediction import Predictor
+from pred_core.live.prediction_records import Rules
 from pred_core.live.scoring import Scorer
 
 SECOND = 1_000_000_000
@@ -130,7 +131,7 @@ def test_a_frame_without_points_is_a_frame_where_nothing_is_seen() -> None:
 
 
 def test_poses_without_a_tracker_are_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(prediction, "MAX_WAITING", 50)
+    monkeypatch.setattr(run, "MAX_WAITING", 50)
     machine = predictor()
     for frame in range(80):
         machine.add_pose(pose(frame), CLOSED)

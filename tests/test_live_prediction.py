@@ -13,7 +13,8 @@ from pred_core.bag.grippers import read_gripper_closed, read_gripper_pose
 from pred_core.bag.reader import open_bag
 from pred_core.bag.wire import GRIPPER_POSE, REQUIRED, TRACKER_POINTS
 from pred_core.evaluate.protocol import predict
-from pred_core.live.prediction import Predictor, Rules
+from pred_core.live.prediction import Predictor
+from pred_core.live.prediction_records import Rules
 from pred_core.pred import load_dynamics
 from pred_core.residual.config import ResidualConfig
 from pred_core.residual.network import build_network

@@ -6,124 +6,20 @@ for each period of measured gripper poses: exactly what the offline evaluation d
 
 from __future__ import annotations
 
-import dataclasses
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from collections.abc import Iterable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from pred_core.bag.align import slerp
 from pred_core.bag.clouds import PointFrame
-from pred_core.bag.episode import GRASP_RADIUS
-from pred_core.bag.grippers import PoseFrame
-from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
-from pred_core.calibration import Calibration
-from pred_core.dynamics import Dynamics
-from pred_core.errors import DivergenceError, InputError, TwinError
-from pred_core.live.delay import DelayedPoses
-from pred_core.live.laps import Laps, Time
-from pred_core.live.prediction_records import Counts, Pose, Prediction, Rules, grip_of
+from pred_core.live.laps import Time
+from pred_core.live.prediction_records import Pose, Prediction
+from pred_core.live.run import ON_GRID, Run
 from pred_core.types import Grip, State
 
-ON_GRID = 0.25  # periods; a pose this close to the next step is taken as it is
-MAX_WAITING = 4_000  # tracker frames kept while poses are awaited, and poses while frames are
 
-
-class Predictor:
-    """Feed `add_points` and `add_pose` in order of arrival; `advance` gives what can be predicted now.
-
-    What comes in is corrected by `calibration`; predictions are true places, at the stamps of the tracker (what they
-    show is its delay older).
-    """
-
-    def __init__(
-        self,
-        dynamics: Dynamics,
-        ids: NDArray[np.uint32],
-        held: Mapping[int, int] | None,
-        rules: Rules,
-        calibration: Calibration | None = None,
-    ):
-        self._dynamics = dynamics
-        self._ids = np.asarray(ids, np.uint32)
-        self._held = held
-        self._rules = rules
-        self._calibration = calibration or Calibration()
-        self._delayed = DelayedPoses(self._calibration.delay, rules.max_gap) if self._calibration.delay else None
-        self._period = round(dynamics.period * 1e9)  # [ns]
-        self._frames: deque[tuple[Time, PointFrame]] = deque()
-        self._poses: deque[Pose] = deque()
-        self._laps: Laps[Callable[[Time], None]] = Laps(rules.max_gap)
-        self._pose_lap = 0
-        self._state: State | None = None
-        self._time: Time = (-1, 0)  # of the state
-        self._begin: Time = (-1, 0)  # frames before it belong to what is over
-        self._cancelled = False
-        self._before: Pose | None = None  # the last pose at or before the state's next time
-        self.halted: DivergenceError | None = None
-        self.counts = Counts()
-
-    @property
-    def running(self) -> bool:
-        """True once a run has started and not ended."""
-        return self._state is not None
-
-    @property
-    def backlog(self) -> float:
-        """[s] of poses that wait to be stepped over."""
-        return len(self._poses) * self._dynamics.period if self.running else 0.0
-
-    def reset(self) -> None:
-        """End the run and forget all stamps; the next run starts from the tracker frames that follow."""
-        self._state = self._before = None
-        self.halted = None
-        self._frames.clear()
-        self._poses.clear()
-        self._laps.clear()
-        if self._delayed is not None:
-            self._delayed.clear()
-        self._pose_lap, self._time, self._begin = 0, (-1, 0), (-1, 0)
-
-    def cancel(self) -> None:
-        """End `advance` at its next step, within a long horizon too; for another thread, at the end of all."""
-        self._cancelled = True
-
-    def add_points(self, frame: PointFrame) -> None:
-        """A tracker frame; without points, nothing is seen.
-
-        Raises: TwinError if it has particles the twin does not know; InputError for its stamp (laps.py).
-        """
-        unknown = np.setdiff1d(frame.id, self._ids)
-        if len(unknown):
-            raise TwinError(
-                "the particle ids of tracker/points do not match the twin",
-                got=f"{len(unknown)} unknown ids, e.g. {unknown[:5].tolist()}",
-                allowed=f"{len(self._ids)} ids, {self._ids.min()} to {self._ids.max()}",
-                next_step="Give the twin that was identified on this object's tracks",
-            )
-        frame = dataclasses.replace(frame, position=self._calibration.correct_points(frame.position))
-        self._take(TRACKER_POINTS, frame.stamp, lambda time: self._keep_frame(time, frame))
-
-    def add_pose(self, pose: PoseFrame, closed: NDArray[np.bool_]) -> None:
-        """A gripper pose.
-
-        Raises: InputError if the flags do not match, a held particle has no gripper, or for its stamp (laps.py).
-        """
-        count = len(pose.position)
-        if len(closed) != count:
-            raise InputError(
-                f"{GRIPPER_CLOSED} does not match {GRIPPER_POSE}", got=f"{len(closed)} flags", allowed=count
-            )
-        needed = max(self._held.values(), default=-1) + 1 if self._held else 0
-        if count < needed:
-            raise InputError(f"{GRIPPER_POSE}: too few grippers for 'held'", got=count, allowed=f"{needed} or more")
-        position, rotation = self._calibration.correct_pose(pose.position, pose.rotation)
-        pose = PoseFrame(pose.stamp, position, rotation)
-        for p, c in [(pose, closed)] if self._delayed is None else self._delayed.take(pose, closed):
-            self._take(GRIPPER_POSE, p.stamp, partial(self._keep_posed, p, c))
+class Predictor(Run):
+    """The model alone from a measured start, or, with the rule `correct`, restarted from every measured frame."""
 
     def advance(self) -> Iterable[Prediction]:
         """Predictions that the data so far allow, oldest first.
@@ -149,50 +45,6 @@ class Predictor:
             if prediction is not None:
                 yield prediction
 
-    def _take(self, topic: str, stamp: int, keep: Callable[[Time], None]) -> None:
-        for time, action in self._laps.take(topic, stamp, keep):
-            action(time)
-
-    def _keep_posed(self, pose: PoseFrame, closed: NDArray[np.bool_], time: Time) -> None:
-        self._keep_pose(Pose(pose, closed, time[0]))
-
-    def _keep_frame(self, time: Time, frame: PointFrame) -> None:
-        while self._frames and self._frames[-1][0] >= time:  # their stamps were out of line
-            self._frames.pop()
-            self.counts.dropped_frames += 1
-        self._frames.append((time, frame))
-        if len(self._frames) > MAX_WAITING:
-            self._frames.popleft()
-            self.counts.dropped_frames += 1
-
-    def _keep_pose(self, pose: Pose) -> None:
-        while self._poses and self._poses[-1].time >= pose.time:  # their stamps were out of line
-            self._poses.pop()
-            self.counts.dropped_poses += 1
-        if self._before is not None and self._before.time >= pose.time:
-            self._end_run(pose)
-        self._begin = min(self._begin, pose.time)
-        if pose.lap > self._pose_lap:
-            self._pose_lap = pose.lap
-            self.counts.jumps += 1
-        self._poses.append(pose)
-        if self._state is None and len(self._poses) > MAX_WAITING:
-            self._before = self._poses.popleft()
-            self.counts.dropped_poses += 1
-
-    def _ends_run(self, pose: Pose) -> bool:
-        if self._before is None:
-            return False
-        lap, stamp = self._before.time
-        return pose.lap != lap or pose.pose.stamp - stamp > self._rules.max_gap * 1e9
-
-    def _end_run(self, pose: Pose) -> None:
-        if self._before is not None and pose.lap == self._before.lap:
-            self.counts.gaps += 1
-        self._state = self._before = None
-        self.halted = None
-        self._begin = (pose.lap, pose.pose.stamp - self._period // 2)
-
     def _start(self) -> bool:
         """Start from the oldest two complete neighbouring frames that have a pose. False: more data needed."""
         while self._frames and self._frames[0][0] < self._begin:
@@ -211,19 +63,13 @@ class Predictor:
             return self._start_at(time, first, second)
         return False
 
-    def _start_at(self, time: tuple[int, int], first: PointFrame, second: PointFrame) -> bool:
-        while self._poses and self._poses[0].time < (time[0], time[1] - round(ON_GRID * self._period)):
-            self._before = self._poses.popleft()
-        if not self._poses:
-            return False
-        pose = self._poses[0]
-        if pose.lap != time[0] or pose.pose.stamp - time[1] > ON_GRID * self._period:
-            if self._before is None or self._before.lap != time[0] or self._ends_run(pose):
-                self._frames.popleft()  # the poses begin later: this pair cannot be used
-                return bool(self._frames) and len(self._frames) >= 2
-            grip, pose = self._between(self._before, pose, time[1]), self._before
-        else:
-            grip, pose = pose.grip(), self._poses.popleft()
+    def _start_at(self, time: Time, first: PointFrame, second: PointFrame) -> bool:
+        grip = self._reach(time)
+        if grip is None:
+            if not self._poses:
+                return False
+            self._frames.popleft()  # the poses begin later: this pair cannot be used
+            return len(self._frames) >= 2
         order = np.argsort(second.id)[np.searchsorted(np.sort(second.id), self._ids)]
         earlier = np.argsort(first.id)[np.searchsorted(np.sort(first.id), self._ids)]
         now, before = second.position[order], first.position[earlier]
@@ -234,63 +80,23 @@ class Predictor:
             held=torch.as_tensor(self._held_by(before, self._grip_near(first.stamp, grip)), dtype=torch.int32),
         )
         self._state = self._dynamics.start(state, grip)
-        self._time, self._before = time, pose
+        self._time = time
         self.counts.runs += 1
         self._prune()
         return True
 
     def _step(self, pose: Pose) -> Prediction | None:
-        assert self._state is not None and self._before is not None
-        next_stamp = self._time[1] + self._period
-        offset = pose.pose.stamp - next_stamp
-        if offset < -ON_GRID * self._period:
-            self.counts.unused_poses += 1
-            self._before = pose
+        assert self._state is not None
+        reached = self._next_grip(pose)
+        if reached is None:
             return None
-        if offset > ON_GRID * self._period:
-            self._poses.appendleft(pose)
-            self.counts.interpolated += 1
-            grip, stamp, last = self._between(self._before, pose, next_stamp), next_stamp, self._before
-        else:
-            grip, stamp, last = pose.grip(), pose.pose.stamp, pose
+        grip, stamp, previous = reached
         begin = self._corrected(self._state) if self._rules.correct == "tracks" else self._state
-        previous, self._before = self._before, last
         state = self._stepped(begin, grip, stamp)
         self.counts.steps += 1
         self._state, self._time = state, (pose.lap, stamp)
         self._prune()
         return self._ahead(stamp, state, grip, previous)
-
-    def _stepped(self, state: State, grip: Grip, stamp: int) -> State:
-        """One step that must stay finite. Raises: DivergenceError; the run is over then."""
-        try:
-            after = self._dynamics.step(state, grip)
-            if bool(torch.isfinite(after.position).all() and torch.isfinite(after.velocity).all()):
-                return after
-            reason = "not finite"
-        except DivergenceError as error:
-            reason = str(error)
-        self._state = None
-        self.halted = DivergenceError(
-            f"the simulation diverged at stamp {stamp * 1e-9:.3f} s",
-            got=reason,
-            next_step="Check the twin and the gripper pose; ~/reset starts again",
-        )
-        raise self.halted
-
-    def _ahead(self, stamp: int, state: State, grip: Grip, previous: Pose) -> Prediction | None:
-        count = round(self._rules.horizon / self._dynamics.period)
-        if count == 0:
-            return Prediction(stamp, state, stamp, state)
-        elapsed = max(stamp - previous.pose.stamp, 1) * 1e-9
-        velocity = (grip.position - torch.as_tensor(previous.pose.position, dtype=torch.float32)) / elapsed
-        ahead = state
-        for k in range(1, count + 1):
-            if self._cancelled:
-                return None
-            moved = Grip(grip.position + velocity * (k * self._dynamics.period), grip.rotation, grip.closed)
-            ahead = self._stepped(ahead, moved, stamp + k * self._period)
-        return Prediction(stamp, state, stamp + count * self._period, ahead)
 
     def _corrected(self, state: State) -> State:
         """Particles measured at the state's time (and one frame before) take their measured place and velocity."""
@@ -320,26 +126,8 @@ class Predictor:
     def _missing(self, frame: PointFrame) -> set[int]:
         return set(self._ids.tolist()) - set(frame.id[frame.visible].tolist())
 
-    def _held_by(self, position: NDArray[np.float64], grip: Grip) -> NDArray[np.int32]:
-        held = np.full(len(self._ids), -1, np.int32)
-        if self._held is not None:
-            for particle, gripper in self._held.items():
-                held[self._ids == particle] = gripper
-            return held
-        distance = np.linalg.norm(position[:, None] - grip.position.double().numpy()[None], axis=-1)
-        distance[:, ~grip.closed.numpy()] = np.inf
-        near = distance.min(axis=1) <= GRASP_RADIUS
-        held[near] = distance.argmin(axis=1)[near]
-        return held
-
     def _grip_near(self, stamp: int, otherwise: Grip) -> Grip:
         """The gripper at the first frame of a run, where the pose then was measured."""
         if self._before is None or abs(self._before.pose.stamp - stamp) > ON_GRID * self._period:
             return otherwise
         return self._before.grip()
-
-    def _between(self, a: Pose, b: Pose, stamp: int) -> Grip:
-        weight = (stamp - a.pose.stamp) / (b.pose.stamp - a.pose.stamp)
-        position = a.pose.position + weight * (b.pose.position - a.pose.position)
-        rotation = slerp(a.pose.rotation, b.pose.rotation, np.full(len(position), weight))
-        return grip_of(position, rotation, a.closed)
