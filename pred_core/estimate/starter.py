@@ -20,6 +20,7 @@ from pred_core.types import Array, Body
 SMOOTHER = 4.0  # times the distance over which errors are alike: the shape itself is smoother than the model's errors
 SHAPE = 0.3  # [m] how far the body may be from its rest shape, moved as a whole
 SPEED = 1.0  # [m/s]
+FULL = 0.6  # share of the window that its tracks must span
 SLOWEST = 0.02  # [s] between two looks at a particle that give it a velocity
 
 
@@ -47,7 +48,7 @@ class Starter:
         """Tracks newer than those before."""
         good = seen.confidence > self._config.least_confidence
         self._seen.append(Measurement(seen.stamp, seen.index[good], seen.position[good], seen.confidence[good]))
-        while (seen.stamp - self._seen[0].stamp) / NS > self._config.start_window:
+        while len(self._seen) > 2 and (seen.stamp - self._seen[0].stamp) / NS > self._config.start_window:
             self._seen.popleft()
 
     def clear(self) -> None:
@@ -64,6 +65,8 @@ class Starter:
         if len(self._seen) < 2 or len(self.unseen()) > (1.0 - self._config.least_seen) * self._body.count:
             return None
         stamp = self._seen[-1].stamp
+        if (stamp - self._seen[0].stamp) / NS < FULL * self._config.start_window:
+            return None
         index, place, speed, moving = self._newest(stamp)
         reference = _moved_onto(self._body.rest_position, index, place)
         noise = np.full(len(index), self._config.noise**2)

@@ -1,0 +1,119 @@
+"""The follower without any process: late tracks, holes, the end of tracks, a loop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pred_core.bag.clouds import PointFrame
+from pred_core.bag.grippers import PoseFrame
+from pred_core.estimate.config import EstimatorConfig
+from pred_core.live.following import Follower
+from pred_core.live.prediction_records import Prediction, Rules
+from pred_core.pred import load_dynamics
+from pred_core.twin import Twin
+
+TWIN = Twin.load(Path(__file__).parents[1] / "config" / "twins" / "plant_rope")
+COUNT = TWIN.body.count
+TICK = 13_333_333  # [ns] of the poses, 75 Hz
+BEGIN = 5_000_000_000  # [ns]
+CLOSED = np.array([True])
+
+
+def hanging() -> np.ndarray:
+    """(N, 3) [m] at rest under the gripper at (0, 0, 1); the twin stretches by half a percent under its own weight."""
+    place = np.zeros((COUNT, 3))
+    place[:, 2] = 1.0 - np.concatenate(([0.0], np.cumsum(TWIN.body.rest_length)))
+    return place
+
+
+def seen(stamp: int, index: np.ndarray | None = None, up: float = 0.0) -> PointFrame:
+    """Tracks of some particles."""
+    index = np.arange(COUNT) if index is None else index
+    place = hanging()[index] + [0.0, 0.0, up]
+    return PointFrame(stamp, place, index.astype(np.uint32), np.full(len(index), 0.95, np.float32), None)
+
+
+def follow(
+    follower: Follower, ticks: range, every: int = 5, delay: int = 0, index: np.ndarray | None = None
+) -> list[Prediction]:
+    """Poses at every tick, tracks captured at every `every`-th (0: none), `delay` ticks late."""
+    given: list[Prediction] = []
+    with torch.no_grad():
+        for tick in ticks:
+            stamp = BEGIN + tick * TICK
+            pose = PoseFrame(stamp, np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0, 0.0]]))
+            follower.add_pose(pose, CLOSED)
+            if every and tick >= delay and (tick - delay) % every == 0:
+                follower.add_points(seen(stamp - delay * TICK, index))
+            given += list(follower.advance())
+    return given
+
+
+def follower(**config: float) -> Follower:
+    return Follower(load_dynamics(TWIN), TWIN.body, {0: 0, 1: 0}, Rules(), config=EstimatorConfig(**config))
+
+
+def test_it_starts_and_gives_a_state_at_each_period_and_correction() -> None:
+    one = follower()
+    given = follow(one, range(90))
+    stamps = [p.stamp for p in given]
+    assert one.running and one.counts.runs == 1 and stamps == sorted(stamps)
+    # One period is 2.5 ticks of the poses; the last state is at most a period older than the last pose.
+    assert 0 <= BEGIN + 89 * TICK - stamps[-1] < round(TWIN.meta.period * 1e9) + TICK
+    assert np.abs(given[-1].state.position.numpy() - hanging()).max() < 0.008  # 3.5 mm of stretch, and a bounce
+    condition = one.condition()
+    assert condition.level == "ok" and condition.trouble() == "" and condition.tally.rejected == 0
+
+
+def test_it_starts_though_a_third_is_never_seen_and_never_all_at_once() -> None:
+    """The open loop would wait for two complete frames for ever."""
+    one = follower()
+    index = np.setdiff1d(np.arange(COUNT), np.arange(10, 20))
+    given = follow(one, range(60), index=index)
+    assert given and np.abs(given[-1].state.position.numpy() - hanging()).max() < 0.02
+
+
+def test_late_tracks_lead_to_the_same_state() -> None:
+    """The same captures, 107 ms later: once the last of them are in, the states agree, bit for bit."""
+    states = {}
+    for delay in (0, 8):
+        one = follower()
+        follow(one, range(191 + delay), delay=delay)  # the last tracks are captured at tick 190
+        given = follow(one, range(191 + delay, 240), every=0)
+        states[delay] = {p.stamp: p.state.position for p in given}
+    stamps = [s for s in states[0] if s in states[8]]
+    assert len(stamps) > 10
+    for stamp in stamps:
+        assert torch.equal(states[0][stamp], states[8][stamp])
+
+
+def test_without_tracks_it_stops_giving_states_and_goes_on_when_they_are_back() -> None:
+    one = follower(stop_after=1.0)
+    assert follow(one, range(60))
+    given = follow(one, range(60, 100), every=0)
+    assert given and "model alone" in one.condition().trouble()
+    given = follow(one, range(100, 200), every=0)
+    last = max((p.stamp for p in given), default=0)
+    # The last tracks were captured at tick 55.
+    assert last <= BEGIN + 55 * TICK + 1_000_000_000 and one.condition().level == "stopped"
+    assert "no state is given" in one.condition().trouble()
+    assert follow(one, range(200, 230)) and one.condition().level == "ok" and one.counts.runs == 1
+
+
+def test_frames_older_than_the_history_are_counted() -> None:
+    one = follower(history=0.1)
+    follow(one, range(60))  # the last tracks were captured at tick 55
+    follow(one, range(60, 80), every=0)
+    follow(one, range(80, 100), delay=20)  # captured at ticks 60, 65, 70, 75, each 0.27 s late
+    assert one.condition().tally.late == 4 and one.counts.runs == 1
+    assert "tracks come too late" in one.condition().trouble()
+
+
+def test_a_loop_starts_a_new_run() -> None:
+    one = follower()
+    follow(one, range(90))
+    given = follow(one, range(60))
+    assert one.counts.runs == 2 and one.counts.jumps == 1 and given[-1].stamp <= BEGIN + 60 * TICK
