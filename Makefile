@@ -1,5 +1,7 @@
 # make run    the main job: measured cable -> ROS 2 topics -> prediction -> score and report
 #             (make run ARGS="--factor 2 --episodes 14"; ARGS=--help lists them)
+# make reroute  cameras to arm: a rope led through a slot, as processes; bag, report, video
+#             (make reroute ARGS="--fault tracker_killed"; ARGS=--help lists them)
 # make test   set-up, lint, tests            make bench  the benchmarks
 # make cables every number of the measured cables and the twins that ship (half an hour)
 # make lint   ruff and mypy                  make clean  remove what was built (out/ and data/ stay)
@@ -13,7 +15,7 @@ EXTRAS := ros,vision,plant,hardware,dev
 PYTHON ?= $(shell for p in python3.11 python3.12 python3 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' >/dev/null 2>&1 && echo $$p && break; done)
 
-.PHONY: run test bench cables lint setup clean
+.PHONY: run reroute test bench cables lint setup clean
 
 setup: $(STAMP)
 
@@ -25,6 +27,9 @@ $(STAMP): setup.py setup.cfg pyproject.toml constraints.txt
 
 run: $(STAMP)
 	$(BIN)/python -m pred_ros.replay $(ARGS)
+
+reroute: $(STAMP)
+	$(BIN)/python -m pred_ros.reroute $(ARGS)
 
 test: lint
 	$(BIN)/python -m pytest -q

@@ -79,6 +79,7 @@ setup(
             "pred = pred_core.cli.main:main",
             "pred_replay = pred_ros.replay:main",
             "pred_bringup = pred_ros.bringup:main",
+            "pred_reroute = pred_ros.reroute:main",
             *(f"{name} = pred_ros.{name}_node:main" for name in NODES),
         ]
     },

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,13 +25,15 @@ class _Camera:
     intrinsics: Array | None = None
     size: tuple[int, int] = (0, 0)
     pose: Array | None = None
-    heard: float = 0.0  # [s] monotonic
+    heard: float = -math.inf  # [s] on the clock given
 
 
 class CameraPairs:
     """Messages go in from the executor's thread, pictures come out to the worker."""
 
-    def __init__(self, names: Sequence[str]):
+    def __init__(self, names: Sequence[str], clock: Callable[[], float] = time.monotonic):
+        """clock [s]: that silence is judged on; the one of the stamps if that may be slow."""
+        self._clock = clock
         self._cameras = {name: _Camera() for name in names}
         self._wake = threading.Condition()
         self._open = True
@@ -42,7 +45,7 @@ class CameraPairs:
         stamp = stamp_of(message)
         mine, other = (camera.color, camera.depth) if kind == "color" else (camera.depth, camera.color)
         with self._wake:
-            camera.heard = time.monotonic()
+            camera.heard = self._clock()
             mine[stamp] = message
             while len(mine) > KEPT:
                 del mine[min(mine)]
@@ -85,7 +88,7 @@ class CameraPairs:
 
     def silent(self, limit: float) -> list[str]:
         """Cameras without a picture for `limit` [s]."""
-        now = time.monotonic()
+        now = self._clock()
         return [n for n, c in self._cameras.items() if now - c.heard > limit]
 
     def picture(self, name: str, pair: tuple[Any, Any]) -> CameraFrame:
@@ -113,5 +116,5 @@ class CameraPairs:
         return any(c.ready is not None for c in self._cameras.values())
 
     def _missing(self) -> bool:
-        now = time.monotonic()
+        now = self._clock()
         return any(c.ready is None and now - c.heard < 0.5 for c in self._cameras.values())

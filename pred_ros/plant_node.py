@@ -34,7 +34,7 @@ from pred_ros.paced_worker import PacedWorker
 from pred_ros.plant_topics import PlantTopics
 from pred_ros.shell import Shell
 
-SLOW = 0.9  # of the factor asked for
+SLOW = 0.8  # of the factor asked for
 LONGEST = 10.0  # [s] a command may lie ahead in lock-step
 LIVE = ("dead_cameras", "bumped_cameras", "factor", "seed")  # parameters that may change at any time
 

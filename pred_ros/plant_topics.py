@@ -19,6 +19,7 @@ from pred_core.plant.live.station import Moment, Picture
 from pred_ros import arm_messages, convert, image_messages, qos
 
 POSE_EVERY = 2  # ticks: gripper/pose at 75 Hz
+CLOSED_EVERY = 150  # ticks: gripper/closed once a second too, for readers that came late
 TRUTH = "~/truth"
 
 
@@ -74,7 +75,7 @@ class PlantTopics:
 
     def _publish_arm(self, moment: Moment) -> None:
         truth = moment.truth
-        if truth.closed != self._closed:
+        if truth.closed != self._closed or self._ticks % CLOSED_EVERY == 0:
             self._closed = truth.closed
             self._flags.publish(convert.closed_to_message(arm_messages.closed_flag(truth.closed)))
         if self._ticks % POSE_EVERY and not moment.pictures:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import threading
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -40,6 +41,7 @@ from pred_ros.shell import Shell
 
 REFUSED_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
 SILENT = 1.0  # [s] without a picture before a camera counts as dead
+GAP, GAP_TIMES = 0.25, 2.5  # [s], usual times between pictures: a longer silence of all cameras is said afterwards
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,8 @@ class TrackerNode(Shell):
         self._status = "searching"
         self._odd: tuple[str, float] | None = None
         self._slipped = False
+        self._gap = ""
+        self._spacings: deque[float] = deque(maxlen=9)  # [s] between the newest pictures
         self._stopping = False
 
     def setup(self) -> None:
@@ -141,8 +145,8 @@ class TrackerNode(Shell):
 
     def start(self) -> None:
         """Subscribe and start the worker."""
-        self._pairs = CameraPairs(self._names)
-        self._stopping = False
+        self._pairs = CameraPairs(self._names, self.seconds)
+        self._stopping, self._published = False, -1
         self._worker = self._pool.submit(self._work)
         for name in self._names:
             for kind, topic in (("color", images.COLOR), ("depth", images.DEPTH)):
@@ -189,13 +193,15 @@ class TrackerNode(Shell):
             return
         self.diagnostics.value("pictures dropped, newer came", str(self._pairs.dropped))
         silent = self._pairs.silent(SILENT)
-        refused_age = self.diagnostics.age("refused message")
+        refused_age, gap_age = self.diagnostics.age("refused message"), self.diagnostics.age("last gap")
         if refused_age is not None and refused_age < REFUSED_SHOWN:
             self.report(ERROR, self._refused)
         elif len(silent) == len(self._names):
             self.report(ERROR, f"no pictures of {', '.join(silent)}: nothing is tracked")
         elif self._status != "tracking":
             self.report(WARN, f"{self._status}: the object is not in view, or is not a {self.config.kind}")
+        elif gap_age is not None and gap_age < REFUSED_SHOWN:
+            self.report(WARN, self._gap)
         elif self._slipped:
             self.report(WARN, "tracking; the object has slipped out of the gripper")
         elif self._odd is not None:
@@ -287,12 +293,28 @@ class TrackerNode(Shell):
 
     def _publish(self, estimate: Estimate) -> None:
         t = estimate.tracks
+        if int(t.stamp) == self._published:  # a late camera's picture of the same instant
+            self.diagnostics.count("estimates of an instant that was published")
+            return
+        self._note_gap((int(t.stamp) - self._published) * 1e-9)
+        self._published = int(t.stamp)
         frame = PointFrame(int(t.stamp), t.position, t.id, t.confidence, None)
         self._out.publish(convert.points_to_cloud(frame))
         self._odd, self._slipped = estimate.odd_camera(), estimate.slipped
         self.diagnostics.count("estimates")
         self.diagnostics.value("residual [mm]", f"{1e3 * estimate.residual:.2f}")
         self.diagnostics.value("particles in view", f"{int(t.visible.sum())} of {len(t.id)}")
+
+    def _note_gap(self, spacing: float) -> None:
+        """Say it if the cameras were silent; `spacing` [s] from the instant before to the newest one."""
+        usual = float(np.median(self._spacings)) if self._spacings else np.inf
+        if self._published >= 0 and spacing > 0.0:
+            if spacing > max(GAP, GAP_TIMES * usual):
+                self._gap = f"no pictures of any camera for {spacing:.2f} s; tracking again"
+                self.diagnostics.seen("last gap")
+                self.diagnostics.count("gaps")
+                self.report(WARN, self._gap)
+            self._spacings.append(spacing)
 
 
 def main() -> NoReturn:
