@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 
-from pred_core.errors import ConfigError, InputError, PredError
+from pred_core.errors import BagError, ConfigError, InputError, PredError
 
 Job = Callable[[], str]
 LATE = 0.2  # [s] behind its schedule: what is more is not caught up
@@ -94,6 +94,6 @@ class PacedWorker:
             return
         try:
             done.set_result(job())
-        except (ConfigError, InputError) as error:
+        except (BagError, ConfigError, InputError) as error:  # the rest ends the node
             done.set_exception(error)
             self._refused(error)

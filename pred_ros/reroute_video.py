@@ -5,7 +5,10 @@ VP8 in WebM: OpenCV's wheels write it without a licence, and current browsers an
 
 from __future__ import annotations
 
+import contextlib
+import os
 from bisect import bisect_right
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -36,7 +39,8 @@ def write_video(record: Record, path: Path) -> int:
     cv2 = _opencv()
     gaps = np.diff([s for s, _ in frames])
     rate = NS / float(np.median(gaps)) if len(gaps) else 10.0
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"VP80"), rate, SIZE)
+    with _quiet():
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"VP80"), rate, SIZE)
     if not writer.isOpened():
         raise ConfigError("this OpenCV cannot write VP8 video", next_step="pip install 'opencv-python-headless<5'")
     for stamp, jpeg in frames:
@@ -99,6 +103,19 @@ def _write(picture: Picture, text: str, place: tuple[int, int], colour: tuple[in
     cv2 = _opencv()
     for width, shade in ((4, (30, 30, 30)), (1, colour)):
         cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, shade, width, cv2.LINE_AA)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """OpenCV's C library prints that it does not know the format's tag, and writes it."""
+    kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)
 
 
 def _opencv() -> ModuleType:

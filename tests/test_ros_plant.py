@@ -159,6 +159,24 @@ def test_lock_step_refuses_what_it_cannot_do_and_steps_on_request() -> None:
         world.bench.until(lambda: world.clock[-1] == before + 33_333_333 or world.clock[-1] == before + 33_333_334, "")
 
 
+def test_a_bad_command_is_named_and_the_plant_goes_on() -> None:
+    with plant(drive="command", **FAST) as world:
+        world.bench.until(lambda: world.poses, "a pose")
+        world.bench.until(lambda: world.command_out.get_subscription_count() == 1, "the plant listens")
+        message = convert.pose_to_message(PoseFrame(world.clock[-1], world.place()[None], np.array([[0.0, 1, 0, 0]])))
+        message.header.frame_id = "camera"
+        world.command_out.publish(message)
+        world.bench.until(lambda: world.bench.says(WARN, "gripper/command", "'camera'", "'world'"), "the frame")
+        message.header.frame_id = "world"
+        message.poses = [*message.poses, *message.poses]
+        world.command_out.publish(message)
+        world.bench.until(lambda: world.bench.says(WARN, "one gripper an arm", "2 poses"), "the number")
+        world.command(np.array([np.nan, 0.0, 0.1]), 0.0)
+        world.bench.until(lambda: world.bench.says(WARN, "finite"), "NaN")
+        now = world.clock[-1]
+        world.bench.until(lambda: world.clock[-1] > now + 100_000_000, "time goes on")
+
+
 def test_free_time_runs_and_publishes_its_factor() -> None:
     with plant(drive="command", factor="0.5", **FAST) as world:
         world.bench.until(lambda: len(world.clock) > 150, "two seconds")
