@@ -27,7 +27,7 @@ START = 180.0  # [s] on the wall until every node has loaded and the first state
 STALLED = 120.0  # [s] on the wall in which the cell's time must go on
 HOLD = 1.0  # [s] of the cell's time that the rope must stay in the slot
 STILL = 3.0  # [s] after the last step of a fault that a resting arm is watched, where the task cannot go on
-EVERY = 2.0  # [s] on the wall between two lines of progress
+EVERY = 5.0  # [s] on the wall between two lines of progress
 LOOK = 0.05  # [s] on the wall between two looks at processes and verdict
 
 Show = Callable[[str], None]

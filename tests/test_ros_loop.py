@@ -1,0 +1,219 @@
+"""The loop as processes: pictures to arm commands, a killed node, and what is left behind; and the judge by hand."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not installed")
+pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+
+from mcap.reader import make_reader
+from sensor_msgs.msg import Image
+
+from pred_core.plant.live.slot import SlotConfig
+from pred_core.plant.live.success import Passage, judge_passage
+from pred_ros import convert, reroute
+from pred_ros.camera_pairs import CameraPairs
+from pred_ros.reroute_faults import FAULTS
+from pred_ros.reroute_record import PlanSeen, Record, Said
+from pred_ros.reroute_report import timeline
+from pred_ros.reroute_verdict import errors, goal_distances, judge
+
+ROOT = Path(__file__).parents[1]
+S = 1_000_000_000  # [ns]
+SETTINGS = """
+motion: {horizon: 1.0, knots: 4}
+search: {samples: 16, chunk: 16, iterations: 1, frames: 4}
+costs: {passage: 1.0}
+slot: {}
+"""
+HARD = 240.0  # [s] after which a run is killed
+
+
+def light(folder: Path, *more: str) -> list[str]:
+    """Command line of a light run on the same path: a gripper without an arm, small pictures, few motions."""
+    settings = folder / "settings.yaml"
+    settings.write_text(SETTINGS, encoding="utf-8")
+    return [
+        sys.executable, "-m", "pred_ros.reroute", "--out", str(folder / "out"),
+        "plant.mover=free", "plant.factor=0.25", "plant.cameras=3", "plant.camera_rate=6.0", "plant.width=320",
+        "plant.height=240", "tracker.cameras=cam0 cam1 cam2", f"planner.settings={settings}", *more,
+    ]  # fmt: skip
+
+
+def run(command: list[str]) -> tuple[int, str]:
+    """Exit code and output; a run that hangs is killed with all its processes."""
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+    try:
+        said, _ = process.communicate(timeout=HARD)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGTERM)
+        said, _ = process.communicate(timeout=30.0)
+        raise AssertionError(f"not over after {HARD:g} s: {said}") from None
+    return process.returncode, said
+
+
+def processes_of(folder: Path) -> list[str]:
+    """Command lines of living processes that name a folder."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            line = entry.read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        except OSError:  # it ended in the meantime
+            continue
+        if str(folder) in line and entry.parent.name != str(os.getpid()):
+            found.append(line)
+    return found
+
+
+def test_a_killed_tracker_stops_the_arm_and_is_taken_up_again(tmp_path: Path) -> None:
+    code, said = run(light(tmp_path, "--fault", "tracker_killed", "--fault-at", "1.0", "--limit", "6.0"))
+    assert code in (0, 1), said
+    out = tmp_path / "out"
+    result = json.loads((out / "reroute.json").read_text())
+    fault = result["fault"]
+    assert fault["name"] == "tracker_killed" and fault["safe"] and fault["collisions"] == 0, said
+    assert fault["named"].startswith(("predictor:", "planner:")), result["said"]
+    assert result["replans"] > fault["plans_after"] > 0, "it planned before, and again after the tracker came back"
+    assert result["tracker_error"]["median"] < 0.01, "320 pixels: one is 3 mm at 1 m"
+    with (out / "run.mcap").open("rb") as stream:
+        topics = {c.topic for _, c, _ in make_reader(stream).iter_messages()}
+    assert {"tracker/points", "state/points", "plan/trajectory", "goal/points", "gripper/pose", "gripper/closed",
+            "joint_states", "/diagnostics", "cam0/color/image_raw/compressed"} - topics == {"joint_states"}  # fmt: skip
+    assert not [t for t in topics if "truth" in t], "the truth is the judge's alone"
+    assert "data:video/webm" in (out / "report.html").read_text() and (out / "video.webm").stat().st_size > 10_000
+    assert processes_of(tmp_path) == []
+
+
+def test_a_node_that_fails_ends_the_run_with_its_own_line(tmp_path: Path) -> None:
+    code, said = run(light(tmp_path, "tracker.cameras=''", "--no-pictures"))
+    assert code == 2
+    assert "the tracker ended with code 2" in said and "parameter 'cameras'" in said
+    assert processes_of(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--twin", "nowhere"], "nowhere"),
+        (["plant.gap"], "NODE.PARAMETER=VALUE"),
+        (["camera.rate=3"], "plant, tracker, predictor, planner, arm"),
+        (["--goal", "goal.png"], "unknown kind of cloud"),
+    ],
+)
+def test_bad_input_is_one_line(arguments: list[str], words: str, capsys: pytest.CaptureFixture, tmp_path: Path) -> None:
+    assert reroute.main([*arguments, "--out", str(tmp_path)]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and words in lines[0]
+
+
+def record_of(path: list[tuple[float, float]]) -> Record:
+    """A gripper at x [m] at times [s]."""
+    record = Record(SlotConfig(), np.zeros((1, 3)))
+    record.gripper = [(round(t * S), np.array([x, 0.0, 0.1])) for t, x in path]
+    record.now = record.gripper[-1][0]
+    return record
+
+
+def test_rest_and_speed_of_a_gripper_that_brakes() -> None:
+    # 0.2 m/s for 1 s, then still: at rest from 1 s on, to the width of the window that judges it.
+    times = np.arange(0.0, 3.0, 0.02)
+    record = record_of([(t, 0.2 * min(t, 1.0)) for t in times.tolist()])
+    rest = record.rests_from(round(0.2 * S))
+    assert rest is not None and rest / S == pytest.approx(1.0, abs=0.03)
+    assert record.at_rest() and record.speed(0, record.now) == pytest.approx(0.2, rel=1e-6)
+    moving = record_of([(t, 0.2 * t) for t in times.tolist()])
+    assert moving.rests_from(0) is None and not moving.at_rest()
+
+
+def test_errors_are_taken_at_the_same_stamp_and_place_along_the_rope() -> None:
+    # The rope moves by 0.1 m/s along z; particles 3 mm beside it, seen between two truths.
+    record = record_of([(0.0, 0.0), (2.0, 0.0)])
+    line = np.column_stack([np.linspace(0.0, 0.7, 33), np.zeros((33, 2))])
+    record.truth = [(k * S, line + [0.0, 0.0, 0.1 * k]) for k in range(3)]
+    seen = np.column_stack([np.linspace(0.0, 0.7, 30), np.zeros((30, 2))])
+    record.tracked = [(S // 2, seen + [0.0, 0.003, 0.05]), (2 * S, seen + [0.0, 0.004, 0.2]), (5 * S, seen)]
+    times, error = errors(record, record.tracked)
+    assert times.tolist() == [0.5, 2.0], "what is newer than the truth is not judged"
+    assert error == pytest.approx([0.003, 0.004], abs=1e-9)
+
+
+def test_a_fault_is_named_by_the_node_that_must_and_speed_and_collisions_decide_safety() -> None:
+    record = record_of([(t, 0.1 * min(t, 2.0)) for t in np.arange(0.0, 5.0, 0.02).tolist()])
+    record.fault, record.values_at_fault = S, {"collisions: gripper on slot": "1", "collisions: rope on slot": "2"}
+    record.values["plant"] = {"collisions: gripper on slot": "1", "collisions: rope on slot": "5"}
+    record.said = [
+        Said(S // 2, "planner", 2, "state/points stopped 0.6 s ago: no planning"),  # before the fault
+        Said(2 * S, "arm", 1, "state/points stopped"),  # another node
+        Said(3 * S, "planner", 2, "state/points stopped 0.7 s ago: no planning"),
+    ]
+    record.plans = [PlanSeen(0, 0.0, 0, np.zeros((2, 3)))]
+    fault = judge(record, 10.0, 0.25, FAULTS["predictor_killed"]).fault
+    assert fault is not None and fault.named.startswith("planner: state/points") and fault.named_after == 2.0
+    assert fault.safe and fault.collisions == 0 and fault.plans_after == 0
+    assert fault.stopped_after == pytest.approx(1.0, abs=0.05) and fault.speed == pytest.approx(0.1, rel=1e-3)
+    record.values["plant"]["collisions: gripper on slot"] = "2"
+    assert not judge(record, 10.0, 0.25, FAULTS["predictor_killed"]).fault.safe  # type: ignore[union-attr]
+    record.values["plant"]["collisions: gripper on slot"] = "1"
+    assert not judge(record, 10.0, 0.05, FAULTS["predictor_killed"]).fault.safe  # type: ignore[union-attr]
+
+
+def test_the_goal_leads_through_the_gap_and_counts_as_success() -> None:
+    goal = reroute.through_slot(SlotConfig(), 0.7)
+    assert np.ptp(goal[:, 1]) == pytest.approx(0.69, abs=0.011) and goal[:, 1].max() == pytest.approx(0.16)
+    assert judge_passage(goal, goal[0], SlotConfig()).success
+    record = Record(SlotConfig(), goal)
+    record.truth = [(S, goal + [0.0, 0.0, 0.02])]
+    # Both sides are 20 mm from the nearest point where it lies flat, a little less where it rises.
+    assert goal_distances(record)[1][0] == pytest.approx(0.04, abs=0.001)
+
+
+def test_success_must_last() -> None:
+    record = record_of([(0.0, 0.0), (4.0, 0.0)])
+    through, beside = Passage(True, 1, 0.3, 0.1, True), Passage(False, 1, 0.3, 0.1, True)
+    record.judged = [(S, through), (2 * S, beside), (3 * S, through), (4 * S, through)]
+    assert record.success and record.succeeded_for() == pytest.approx(1.0)
+
+
+def test_lines_that_differ_in_numbers_are_one_row() -> None:
+    record = record_of([(0.0, 0.0), (1.0, 0.0)])
+    record.said = [Said(k * S, "planner", 2, f"state/points stopped {k}.5 s ago") for k in range(5)]
+    record.said.append(Said(6 * S, "planner", 0, "planning"))
+    record.events = [(2 * S, "the predictor is killed")]
+    rows, marks = timeline(record)
+    assert [(r[1], r[4]) for r in rows] == [("planner", 5), ("run", 1), ("planner", 1)]
+    assert marks == ["warn", "warn", ""]
+
+
+def test_pictures_of_one_instant_stay_together_where_time_runs_slowly() -> None:
+    # At a tenth of real time 10 Hz cameras are a second apart on the wall; on their own clock they were heard just now.
+    now = [1.0]
+    pairs = CameraPairs(["cam0", "cam1"], lambda: now[0])
+    assert pairs.silent(1.0) == ["cam0", "cam1"], "nothing came yet"
+
+    def show(name: str, stamp: int) -> None:
+        for kind in ("color", "depth"):
+            pairs.add_image(name, kind, Image(header=convert.header_at(stamp)))
+
+    show("cam0", S), show("cam1", S)
+    assert set(pairs.take(0.0)) == {"cam0", "cam1"}
+    now[0] = 1.1
+    show("cam0", 11 * S // 10)
+    late = threading.Timer(0.2, show, ("cam1", 11 * S // 10))
+    late.start()
+    assert set(pairs.take(20.0)) == {"cam0", "cam1"}, "it waits for the other one"
+    now[0] = 2.2
+    show("cam0", 22 * S // 10)
+    assert set(pairs.take(20.0)) == {"cam0"}, "a dead one is not waited for"
+    assert pairs.silent(1.0) == ["cam1"]
