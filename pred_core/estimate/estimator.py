@@ -31,8 +31,8 @@ class Estimator:
         self.config = config or EstimatorConfig()
         self.starter = Starter(body, self.config)
         self.tally = Tally()
-        self.scale = NoiseScale()
         self._dynamics, self._body = dynamics, body
+        self.scale = NoiseScale(self.starter.modes, self.config)
         self._history = History(self.config.history)
         self._errors: ErrorFilter | None = None
         self._lengths: Lengths | None = None
@@ -111,9 +111,7 @@ class Estimator:
         self.tally.used += count
         self.tally.rejected += len(used) - count
         self.health.note(stamp, count, len(used) - count)
-        if count:
-            assert self._errors is not None
-            self.scale.follow(self._errors.apart(evidence.only(used)), elapsed)
+        self.scale.follow(evidence.only(used), elapsed)
 
     def _apply(self, at: int, change: Correction, later: float) -> None:
         """Correct node `at` so that `later` [s] after it the change is there, and simulate the nodes after it anew."""

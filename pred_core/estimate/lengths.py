@@ -15,7 +15,7 @@ from pred_core.types import Array, Body
 
 STEPS = 3  # Newton steps to the lengths
 RIDGE = 1e-6  # of the diagonal: nets of springs have more lengths than particles can move
-DENSE = 300  # springs that are solved for at once
+DENSE = 150  # springs that are solved for at once
 SWEEPS = 40  # of conjugate gradients, for more
 
 
@@ -53,12 +53,15 @@ class Lengths:
         if not len(growth):
             return np.zeros((self._shape[1] // 3, 3))
         values = np.stack((-along, along), axis=1).reshape(-1)
-        jacobian = csr_array((values, self._places), shape=self._shape)
-        weighted = jacobian * self._weight
-        normal = weighted @ jacobian.T
-        ridge = RIDGE * float(normal.diagonal().max())
         if len(growth) <= DENSE:
-            tension = np.linalg.solve(normal.toarray() + ridge * np.eye(len(growth)), growth)
-        else:
-            tension, _ = cg(normal + ridge * eye_array(len(growth)), growth, maxiter=SWEEPS)
+            jacobian = np.zeros(self._shape)
+            jacobian[self._places] = values
+            weighted = jacobian * self._weight
+            normal = weighted @ jacobian.T
+            normal[np.diag_indices_from(normal)] += RIDGE * normal.diagonal().max()
+            return np.asarray(np.linalg.solve(normal, growth) @ weighted).reshape(-1, 3)
+        sparse = csr_array((values, self._places), shape=self._shape)
+        weighted = sparse * self._weight
+        normal = weighted @ sparse.T
+        tension, _ = cg(normal + RIDGE * normal.diagonal().max() * eye_array(len(growth)), growth, maxiter=SWEEPS)
         return np.asarray(weighted.T @ tension).reshape(-1, 3)

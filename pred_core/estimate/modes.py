@@ -18,6 +18,7 @@ from pred_core.types import Array, Body
 
 DIMENSIONS = {"line": 1, "sheet": 2, "volume": 3, "mixed": 2}
 ROUGH = 1e-4  # share of an error's variance that no correlation explains
+SMOOTHER = 4.0  # times the distance over which errors are alike: shapes, and what tracks have in common with neighbours
 DENSE = 1500  # particles up to which all eigenvectors are found at once
 
 

@@ -14,10 +14,9 @@ from pred_core.estimate.gate import agreeing
 from pred_core.estimate.history import NS
 from pred_core.estimate.lengths import Lengths
 from pred_core.estimate.measurement import Measurement
-from pred_core.estimate.modes import error_modes
+from pred_core.estimate.modes import SMOOTHER, error_modes
 from pred_core.types import Array, Body
 
-SMOOTHER = 4.0  # times the distance over which errors are alike: the shape itself is smoother than the model's errors
 SHAPE = 0.3  # [m] how far the body may be from its rest shape, moved as a whole
 SPEED = 1.0  # [m/s]
 FULL = 0.6  # share of the window that its tracks must span
@@ -41,7 +40,7 @@ class Starter:
         self._body, self._config = body, config
         self._seen: deque[Measurement] = deque()
         nobody = np.zeros(body.count, bool)
-        self._modes = error_modes(body, nobody, SMOOTHER * config.correlation, config.modes)
+        self.modes = error_modes(body, nobody, SMOOTHER * config.correlation, config.modes)
         self._lengths = Lengths(body, np.ones(body.count))
 
     def add(self, seen: Measurement) -> None:
@@ -100,7 +99,7 @@ class Starter:
     def _spread(self, evidence: Evidence, size: float) -> tuple[Array, NDArray[np.bool_]]:
         """(N, 3) smooth values of about `size` that agree with the evidence, and what (O,) of it was believed."""
         config = replace(self._config, start_position=size)
-        errors = ErrorFilter(self._modes, config)
+        errors = ErrorFilter(self.modes, config)
         among = np.ones(len(evidence.index), bool)
         if not among.any():
             return np.zeros((self._body.count, 3)), among
