@@ -248,13 +248,27 @@ def test_a_flag_with_a_bad_value(
 def test_a_particle_that_is_never_measured(
     world: Path, tmp_path: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In one episode of six."""
+    """In one episode of six, or in the reference: told by its id before anything is computed. Seen in one frame it is
+    never known with its velocity, which is told with the number of frames.
+    """
+
+    def without(e: Episode, ids: list[int], frames: slice) -> Episode:
+        position, seen = e.position.copy(), e.tracks.visible.copy()
+        for i in ids:
+            position[frames, i], seen[frames, i] = np.nan, False
+        tracks = dataclasses.replace(e.tracks, position=position, visible=seen, confidence=seen.astype(np.float32))
+        return dataclasses.replace(e, tracks=tracks)
+
     e = dragged[2]
-    position, seen = e.position.copy(), e.tracks.visible.copy()
-    position[:, 5], seen[:, 5] = np.nan, False
-    tracks = dataclasses.replace(e.tracks, position=position, visible=seen, confidence=seen.astype(np.float32))
-    data = write(tmp_path / "data", [*dragged[:2], dataclasses.replace(e, tracks=tracks), *dragged[3:]])
-    assert e.name in refusal(capsys, data, world / "twin", tmp_path / "out")
+    never = write(tmp_path / "never", [*dragged[:2], without(e, [5, 7], slice(None)), *dragged[3:]])
+    line = refusal(capsys, never, world / "twin", tmp_path / "out")
+    assert f"{e.name}: particles of the twin are never measured" in line and "got id 5, 7;" in line
+    assert "leave the episode out" in line and "rest_length" in line
+    against = ("--reference", str(never))
+    assert f"reference, {e.name}:" in refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", *against)
+    once = write(tmp_path / "once", [*dragged[:2], without(e, [5], slice(1, None)), *dragged[3:]])
+    line = refusal(capsys, once, world / "twin", tmp_path / "out")
+    assert f"{e.name}: no window" in line and "40 frames, id 5 in 1" in line
 
 
 def test_a_reference_of_another_rate(
@@ -266,7 +280,10 @@ def test_a_reference_of_another_rate(
         faster.append(dataclasses.replace(e, stamps=stamps, tracks=dataclasses.replace(e.tracks, stamp=stamps)))
     against = ("--reference", str(write(tmp_path / "faster", faster, rate=60.0)))
     line = refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", *against)
-    assert "period" in line and "0.01666" in line
+    assert f"reference, {dragged[0].name}: the reference's frames" in line and "got 0.01666" in line
+    assert "--reference recorded at the data set's rate" in line
+    line = refusal(capsys, tmp_path / "faster", world / "twin", tmp_path / "out", *against)
+    assert "Identify a twin at this rate" in line  # both come at it: it is the twin that differs
 
 
 def test_a_damaged_journal(world: Path, found: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

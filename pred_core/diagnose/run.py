@@ -9,6 +9,7 @@ from pred_core.calibration import Calibration
 from pred_core.diagnose.answer import Study, answer
 from pred_core.diagnose.commission import commission
 from pred_core.diagnose.config import DiagnoseConfig
+from pred_core.diagnose.fits import check_tracks
 from pred_core.diagnose.gate import measure
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Tell
@@ -40,6 +41,7 @@ def diagnose(
     train = [e for e in episodes if e.split == "train"]
     known = [e for e in reference or () if e.split != "ood"]
     _check(episodes, train, known, reference)
+    check_tracks(episodes, reference or (), twin)
     gate = measure(train, [e for e in known if e.split == "train"] or None, twin)
     for cause in gate.accepted:
         tell(f"gate: {cause.id}: {cause.effect_mm:.1f} mm at the object, p {cause.p_adjusted:.3g}")
@@ -49,7 +51,6 @@ def diagnose(
     session = min(int(e.stamps[0]) for e in corrected)
     journal = journal or Journal(None, {})
     fitted = [e for e in corrected if e.split != "ood"]
-    _check_ids(fitted, known, plain)
     bench = commission(plain, fitted, known, config, tell, journal, session)
     check_reference(bench)
     progress = Progress(bench, journal, [bench.twin], deadline=begin + LATEST * config.seconds)
@@ -94,19 +95,6 @@ def _check(
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise DatasetError("two bags have one name", got=", ".join(twice[:3]), next_step="Rename one of them")
-
-
-def _check_ids(suspect: Sequence[Episode], known: Sequence[Episode], twin: Twin) -> None:
-    """Raise DatasetError if something is tracked that the twin does not have."""
-    have = {int(i) for i in twin.body.id}
-    for episode in (*suspect, *known):
-        more = [int(i) for i in episode.tracks.id if int(i) not in have]
-        if more:
-            raise DatasetError(
-                f"{episode.name}: tracks have particles that the twin lacks",
-                got=f"id {', '.join(map(str, more[:5]))}",
-                next_step="Identify a twin from this data set or its reference",
-            )
 
 
 def _change_structure(progress: Progress, tell: Tell) -> None:

@@ -104,9 +104,12 @@ def make_sample(
     rows = [(order, n, f) for n, r in enumerate(recordings) for order, f in enumerate(_starts(r, steps, pieces))]
     missing = sorted(set(range(len(even))) - {n for _, n, _ in rows})
     if missing:
+        measured = torch.isfinite(recordings[missing[0]].position).all(dim=-1).sum(dim=0)
+        least = int(measured.argmin())
         raise DatasetError(
             f"{even[missing[0]].name}: no window of {steps * period:.3g} s starts from two complete frames",
-            got=f"{len(recordings[missing[0]].position)} frames",
+            got=f"{len(recordings[missing[0]].position)} frames, "
+            f"id {int(twin.body.id[least])} in {int(measured[least])}",
             next_step="Leave the episode out, or give a shorter --window",
         )
     rows.sort()
