@@ -19,6 +19,7 @@ from torch import Tensor
 
 from pred_core.effects import LIBRARY
 from pred_core.effects.effect import BendContext
+from pred_core.errors import InputError
 from pred_core.frames import quaternion_from_rotation_vector
 from pred_core.springmass import SpringMass
 from pred_core.springmass.reference import Reference
@@ -256,3 +257,23 @@ def _repeated(state: State, first: Grip, worlds: int) -> tuple[State, Grip]:
         v.expand(worlds, *v.shape[1:]).contiguous() for v in (state.position, state.velocity, state.held)
     )
     return State(position, velocity, held), Grip(*(v.expand(worlds, *v.shape[1:]) for v in vars(first).values()))
+
+
+@pytest.mark.parametrize(("degrees", "refused"), [(0.0, True), (3.0, True), (8.0, False), (90.0, False)])
+def test_a_gripper_whose_y_axis_lies_along_the_line_gives_its_bends_no_frame(degrees: float, refused: bool) -> None:
+    body = line()
+    along = torch.as_tensor(body.rest_position[1] - body.rest_position[0], dtype=torch.float32)
+    along = along / along.norm()
+    y = torch.tensor([0.0, 1.0, 0.0])
+    axis = torch.linalg.cross(y, along)  # turns y towards the line
+    turn = axis / axis.norm() * (math.acos(float(y @ along)) - math.radians(degrees))
+    grip = Grip(torch.zeros(1, 3), quaternion_from_rotation_vector(turn)[None], torch.ones(1, dtype=torch.bool))
+    state = holding(state_of(body.rest_position), {0: 0, 1: 0})
+    damped = [LIBRARY["bending_damping"].extension(time=0.05)]
+    SpringMass(body, PHYSICS, Scene(), extensions=()).start(state, grip)  # nothing needs the frame
+    simulator = SpringMass(body, PHYSICS, Scene(), extensions=damped)
+    if refused:
+        with pytest.raises(InputError, match=f"y axis along it.*{degrees:.1f} degrees"):
+            simulator.start(state, grip)
+    else:
+        simulator.start(state, grip)

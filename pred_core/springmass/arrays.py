@@ -100,6 +100,13 @@ def chains(body: Body) -> NDArray[np.int32]:
     return np.stack((edges[:-1], edges[1:]), axis=1).astype(np.int32)
 
 
+def line_ends(body: Body) -> NDArray[np.int64]:
+    """(2K, 2) both ends of each line: the last particle and the one next to it."""
+    bends = np.asarray(body.bends, dtype=np.int64).reshape(-1, 3)
+    lines = chains(body)
+    return np.concatenate((bends[lines[:, 0], :2], bends[lines[:, 1] - 1, :0:-1]))
+
+
 def fixture_row(fixture: Fixture) -> list[float]:
     """16 numbers as `source.CONTACT` reads them."""
     if isinstance(fixture, Sphere):

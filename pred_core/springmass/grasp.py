@@ -11,6 +11,8 @@ from pred_core.errors import InputError
 from pred_core.frames import quaternion_conjugate, quaternion_normalize, quaternion_rotate
 from pred_core.types import Grip, State
 
+LEAST_ACROSS = 0.1  # sine of the least angle between a gripper's y axis and the line it holds
+
 
 def grip_offsets(position: Tensor, held: Tensor, grip: Grip) -> Tensor:
     """Where held particles sit in their gripper's frame, (W, N, 3) [m]; zero for free particles."""
@@ -47,6 +49,32 @@ def check_poses(grip: Grip) -> None:
             raise InputError("gripper pose is not finite", next_step="Stop the arm; check the source of gripper/pose")
         off = f"norm off by {0.5 * error:.3g}"
         raise InputError("gripper rotation is not a unit quaternion (wxyz)", got=off)
+
+
+def check_frames(position: Tensor, ends: Tensor, held: Tensor, grip: Grip) -> None:
+    """Raise InputError where the y axis of a gripper that holds a line's end lies along the line: the frame of the
+    line's bends is that axis across the line, and would be noise.
+
+    position (W, N, 3) [m]; ends (K, 2) indices: a line's end and the particle next to it.
+    """
+    if not (grip.position.shape[1] and len(ends)):
+        return
+    which = held[:, ends[:, 0]]  # (W, K)
+    index = which.clamp_min(0).long()[..., None].expand(*which.shape, 4)
+    rotation = quaternion_normalize(torch.gather(grip.rotation, 1, index))
+    axis = quaternion_rotate(rotation, position.new_tensor([0.0, 1.0, 0.0]).expand(*which.shape, 3))
+    edge = position[:, ends[:, 1]] - position[:, ends[:, 0]]
+    across = torch.linalg.cross(axis, edge).norm(dim=-1)
+    wrong = (which >= 0) & (across < LEAST_ACROSS * edge.norm(dim=-1))
+    if bool(wrong.any()):
+        world, line = wrong.nonzero()[0].tolist()
+        share = float(across[world, line] / edge[world, line].norm().clamp_min(1e-12))
+        raise InputError(
+            f"gripper {int(which[world, line])} holds the line with its y axis along it, so that its bends have no frame",
+            got=f"{math.degrees(math.asin(min(share, 1.0))):.1f} degrees between them",
+            allowed=f"{math.degrees(math.asin(LEAST_ACROSS)):.0f} degrees or more",
+            next_step="Give the gripper's pose with y across the object, or leave out effects in bending",
+        )
 
 
 def flatten_grip(grip: Grip, lead: torch.Size, device: str) -> Grip:

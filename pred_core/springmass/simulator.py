@@ -12,7 +12,7 @@ from torch import Tensor
 from pred_core.dynamics import FARTHEST
 from pred_core.errors import ConfigError, DivergenceError, InputError
 from pred_core.springmass import grasp, kernel
-from pred_core.springmass.arrays import ModelArrays, chains, mass_of_worlds
+from pred_core.springmass.arrays import ModelArrays, chains, line_ends, mass_of_worlds
 from pred_core.springmass.collision import candidate_pairs, connected_within
 from pred_core.springmass.lanes import pack, pack_into, unpack
 from pred_core.springmass.parameters import added_by, effects_of, extensions_per_world, parameter_rows
@@ -77,6 +77,7 @@ class SpringMass:
         slots = 2 + sum(e.bend_memory for e in self.effects)
         # Per line the twist angle and a director, per bend two curvatures and what `bend` hooks keep.
         frame_size = 4 * len(self._lines) + slots * len(body.bends) if framed else 0
+        self._line_ends = torch.as_tensor(line_ends(body)[: None if framed else 0], device=device)
         self._twists = slice(0, 4 * len(self._lines) if framed else 0, 4)
         self._grip_size = body.count * sum(e.grip_memory for e in self.effects)  # at the end: per slot and particle
         self._memory_size = frame_size + self._grip_size
@@ -103,6 +104,7 @@ class SpringMass:
         else:
             grip = grasp.flatten_grip(grip, lead, self.device)
         grasp.check_grip(grip, count, flat.held)
+        grasp.check_frames(flat.position, self._line_ends, flat.held, grip)
         memory = {
             "grip_position": grip.position,
             "grip_rotation": grip.rotation,
