@@ -70,7 +70,7 @@ def check_frames(position: Tensor, ends: Tensor, held: Tensor, grip: Grip) -> No
         world, line = wrong.nonzero()[0].tolist()
         share = float(across[world, line] / edge[world, line].norm().clamp_min(1e-12))
         raise InputError(
-            f"gripper {int(which[world, line])} holds the line with its y axis along it, so that its bends have no frame",
+            f"gripper {int(which[world, line])} holds the line with its y axis along it: its bends have no frame",
             got=f"{math.degrees(math.asin(min(share, 1.0))):.1f} degrees between them",
             allowed=f"{math.degrees(math.asin(LEAST_ACROSS)):.0f} degrees or more",
             next_step="Give the gripper's pose with y across the object, or leave out effects in bending",
