@@ -82,7 +82,7 @@ def outcome(verdict: Verdict) -> str:
     """One line about a fault."""
     fault = verdict.fault
     assert fault is not None
-    arm = "never stood still" if fault.stopped_after is None else f"first stood still after {fault.stopped_after:.1f} s"
+    arm = "went on" if fault.stopped_after is None else f"came to rest after {fault.stopped_after:.1f} s"
     after = "the rope went through the slot" if verdict.success else "the rope did not go through the slot"
     said = f"said after {fault.named_after:.1f} s: {fault.named}" if fault.named else "no node named it"
     hits = "" if fault.safe else f"; NOT SAFE: {fault.speed:.2f} m/s, {fault.collisions} collisions"

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+SENTENCE = 25  # characters; a longer cell is no number
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1b1f24; background: #fff; max-width: 1080px; margin: 2em auto;
        padding: 0 1.2em; }
@@ -18,7 +19,7 @@ p.note, figcaption { color: #57606a; font-size: .9em; max-width: 75ch; }
 table { border-collapse: collapse; margin: .8em 0; font-variant-numeric: tabular-nums; font-size: .92em; }
 th, td { padding: .25em .8em; text-align: right; border-bottom: 1px solid #e4e7eb; }
 th { border-bottom: 2px solid #57606a; font-weight: 600; } th:first-child, td:first-child { text-align: left; }
-tr.strong td { font-weight: 650; } tr.warn td { color: #9a3b00; }
+td.text { text-align: left; } tr.strong td { font-weight: 650; } tr.warn td { color: #9a3b00; }
 figure { margin: 1em 0; } img { max-width: 100%; } code { background: #f2f4f6; padding: .1em .3em; }
 .wide { overflow-x: auto; } p.lead { font-size: 1.2em; line-height: 1.45; margin: .8em 0 1em; }
 """
@@ -53,7 +54,7 @@ class Page:
         body = []
         for i, row in enumerate(rows):
             mark = f' class="{marks[i]}"' if i < len(marks) and marks[i] else ""
-            body.append(f"<tr{mark}>" + "".join(f"<td>{html.escape(str(c))}</td>" for c in row) + "</tr>")
+            body.append(f"<tr{mark}>" + "".join(_cell(str(c)) for c in row) + "</tr>")
         self._parts.append(f'<div class="wide"><table><tr>{head}</tr>{"".join(body)}</table></div>')
 
     def figure(self, figure: Figure, caption: str) -> None:
@@ -75,6 +76,11 @@ class Page:
         head = f'<meta charset="utf-8"><title>{html.escape(self.title)}</title><style>{_STYLE}</style>'
         body = "\n".join(self._parts)
         path.write_text(f'<!doctype html><html lang="en"><head>{head}</head><body>{body}</body></html>\n', "utf-8")
+
+
+def _cell(text: str) -> str:
+    """Sentences are read from the left, numbers stand under each other."""
+    return f"<td{' class=text' if len(text) > SENTENCE else ''}>{html.escape(text)}</td>"
 
 
 def number(value: float | None, digits: int = 3) -> str:
