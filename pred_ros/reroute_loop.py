@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import rclpy
 from rclpy.signals import SignalHandlerOptions
@@ -23,11 +23,12 @@ from pred_ros.reroute_record import NS, Record
 from pred_ros.reroute_watch import Watch
 
 BAG = "run.mcap"
-START = 180.0  # [s] on the wall until every node has loaded and the first state is there
+START = 300.0  # [s] on the wall until every node has loaded and the first state is there
 STALLED = 120.0  # [s] on the wall in which the cell's time must go on
 HOLD = 1.0  # [s] of the cell's time that the rope must stay in the slot
 STILL = 3.0  # [s] after the last step of a fault that a resting arm is watched, where the task cannot go on
 EVERY = 5.0  # [s] on the wall between two lines of progress
+SHARED = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "RMW_IMPLEMENTATION", "FASTRTPS_DEFAULT_PROFILES_FILE")
 LOOK = 0.05  # [s] on the wall between two looks at processes and verdict
 
 Show = Callable[[str], None]
@@ -52,7 +53,7 @@ class Loop:
     def __init__(self, job: Job, children: Children, watch: Watch):
         self._job, self._children, self._watch = job, children, watch
         self._record = watch.record
-        self._killed: set[str] = set()
+        self._names = {node: node for node in job.nodes}  # living node -> process
         self._starts = dict.fromkeys(job.nodes, 1)
 
     def start(self) -> None:
@@ -75,7 +76,7 @@ class Loop:
     def disable(self) -> None:
         """Planner and arm come to rest; who does not answer any more is left."""
         for node in ("planner", "arm"):
-            if node not in self._killed:
+            if node in self._names:
                 self._watch.ask(SetBool, f"/{node}/enable", SetBool.Request(data=False))
 
     def wait(self, condition: Callable[[], bool], limit: float, what: str) -> None:
@@ -91,10 +92,9 @@ class Loop:
     def check(self) -> None:
         """Raises: PredError, with its own last line, if a node ended that nobody killed."""
         for name, process in self._children.running.items():
-            if name not in self._killed and process.poll() is not None:
-                raise PredError(
-                    f"the {name} ended with code {process.returncode}", got=self._children.last_line(name)
-                )
+            if process.poll() is not None:
+                line = self._children.last_line(name)
+                raise PredError(f"the {name} ended with code {process.returncode}", got=line)
 
     # What a fault does.
 
@@ -111,18 +111,15 @@ class Loop:
 
     def kill(self, node: str) -> None:
         """SIGKILL."""
-        process = self._children.running[node]
-        self._killed.add(node)
+        process = self._children.running.pop(self._names.pop(node))
         process.kill()
         process.wait()
 
     def restart(self, node: str) -> None:
         """Again, as at first; its output goes to a file of its own."""
         self._starts[node] += 1
-        name = f"{node}_{self._starts[node]}"
-        self._children.start(name, node_command(node, self._job.nodes[node]))
-        self._killed.discard(node)
-        self._children.running[node] = self._children.running.pop(name)
+        self._names[node] = f"{node}_{self._starts[node]}"
+        self._children.start(self._names[node], node_command(node, self._job.nodes[node]))
         if node == "planner":
             self.enable(node)
 
@@ -136,7 +133,7 @@ def run(job: Job, show: Show) -> Record:
     gap = float(str(job.nodes["plant"].get("gap", SlotConfig.gap)))
     record = Record(SlotConfig(gap=gap), job.goal)
     ended: BaseException | None = None
-    with _environment(environment), BagWriter(job.out / BAG) as writer:
+    with _variables(environment), BagWriter(job.out / BAG) as writer:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         watch = Watch(record, writer, job.camera)
         try:
@@ -209,20 +206,15 @@ def progress(record: Record, factor: float) -> str:
     )
 
 
-class _environment:
+@contextmanager
+def _variables(wanted: Mapping[str, str]) -> Iterator[None]:
     """The variables of the nodes for this process too, as long as the run lasts."""
-
-    def __init__(self, variables: Mapping[str, str]):
-        names = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "RMW_IMPLEMENTATION")
-        self._wanted = {n: variables[n] for n in (*names, "FASTRTPS_DEFAULT_PROFILES_FILE")}
-        self._before: dict[str, str | None] = {}
-
-    def __enter__(self) -> None:
-        self._before = {n: os.environ.get(n) for n in self._wanted}
-        os.environ.update(self._wanted)
-
-    def __exit__(self, *_: Any) -> None:
-        for name, value in self._before.items():
+    before = {name: os.environ.get(name) for name in SHARED}
+    os.environ.update({name: wanted[name] for name in SHARED})
+    try:
+        yield
+    finally:
+        for name, value in before.items():
             if value is None:
                 os.environ.pop(name)
             else:

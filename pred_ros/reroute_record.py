@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +14,7 @@ from pred_core.types import Array
 NS = 1e9
 REST_SPEED = 0.004  # [m/s] of a gripper that stands still
 REST_SPAN = 0.4  # [s] over which that is judged
+SPEED_SPAN = 0.03  # [s] over which a speed is measured
 
 
 @dataclass(frozen=True)
@@ -97,24 +99,25 @@ class Record:
     def rests_from(self, stamp: int) -> int | None:
         """[ns] the first time at or after `stamp` from which the gripper stood still for `REST_SPAN`."""
         path = [(s, p) for s, p in self.gripper if s >= stamp]
-        behind = 0
-        for k, (now, place) in enumerate(path):
-            while (now - path[behind][0]) / NS > REST_SPAN:
-                behind += 1
-            if behind and float(np.linalg.norm(place - path[behind][1])) < REST_SPEED * REST_SPAN:
-                return path[behind][0]
-            if k == len(path) - 1:
-                break
+        for before, now in _spans(path, REST_SPAN):
+            if float(np.linalg.norm(now[1] - before[1])) < REST_SPEED * REST_SPAN:
+                return before[0]
         return None
 
     def speed(self, begin: int, end: int) -> float:
-        """[m/s] the largest of the measured gripper between two stamps, over 40 ms."""
+        """[m/s] the largest of the measured gripper between two stamps, over `SPEED_SPAN`."""
         path = [(s, p) for s, p in self.gripper if begin <= s <= end]
-        most, behind = 0.0, 0
-        for now, place in path:
-            while (now - path[behind + 1][0]) / NS > 0.04 if behind + 1 < len(path) else False:
-                behind += 1
-            span = (now - path[behind][0]) / NS
-            if span > 0.02:
-                most = max(most, float(np.linalg.norm(place - path[behind][1])) / span)
-        return most
+        return max(
+            (float(np.linalg.norm(b[1] - a[1])) / (b[0] - a[0]) * NS for a, b in _spans(path, SPEED_SPAN)), default=0.0
+        )
+
+
+def _spans(path: Sequence[tuple[int, Array]], seconds: float) -> Iterator[tuple[tuple[int, Array], tuple[int, Array]]]:
+    """Of each moment of a path: the newest one that lies at least `seconds` [s] before it, and itself."""
+    behind = 0
+    for now in path:
+        if now[0] - path[behind][0] < seconds * NS:
+            continue
+        while now[0] - path[behind + 1][0] >= seconds * NS:
+            behind += 1
+        yield path[behind], now

@@ -42,7 +42,7 @@ from pred_ros.reroute_record import PlanSeen, Record, Said, View
 DIAGNOSTICS = "/diagnostics"
 TRUTH = "plant/truth"
 JPEG_QUALITY = 80
-ANSWER = 60.0  # [s] on the wall for a service
+ANSWER, AGAIN = 120.0, 8.0  # [s] on the wall for a service, and until it is asked again
 
 
 class Watch:
@@ -89,16 +89,19 @@ class Watch:
         self._goal_out.publish(planner_messages.goal_to_cloud(self.record.now, self.record.goal))
 
     def ask(self, kind: Any, service: str, request: Any) -> Any:
-        """A service's answer. Raises: InputError if none comes."""
+        """A service's answer. Raises: InputError if none comes.
+
+        It asks again now and then: for a while a node that was killed looks as if it were still there.
+        """
         client = self.node.create_client(kind, service)
+        answer: Any = None
+        begin = asked = time.monotonic()
         try:
-            end = time.monotonic() + ANSWER
-            answer = None
-            while time.monotonic() < end:
-                if answer is None and client.service_is_ready():
-                    answer = client.call_async(request)
+            while time.monotonic() - begin < ANSWER:
                 if answer is not None and answer.done():
                     return answer.result()
+                if client.service_is_ready() and (answer is None or time.monotonic() - asked > AGAIN):
+                    answer, asked = client.call_async(request), time.monotonic()
                 self._executor.spin_once(timeout_sec=0.05)
             raise InputError(f"{service} does not answer within {ANSWER:g} s")
         finally:

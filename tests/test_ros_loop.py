@@ -36,7 +36,7 @@ search: {samples: 16, chunk: 16, iterations: 1, frames: 4}
 costs: {passage: 1.0}
 slot: {}
 """
-HARD = 240.0  # [s] after which a run is killed
+HARD = 400.0  # [s] after which a run is killed
 
 
 def light(folder: Path, *more: str) -> list[str]:
