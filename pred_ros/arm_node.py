@@ -117,7 +117,7 @@ class ArmNode(Shell):
             self._arm = make_arm(self.config)
         if self.config.source == "plan":
             self._heard: Any = self.create_subscription(
-                MultiDOFJointTrajectory, arm_messages.PLAN, self._on_plan, qos.command()
+                MultiDOFJointTrajectory, arm_messages.PLAN, self._on_plan, qos.plans()
             )
         else:
             self._heard = self.create_subscription(PoseArray, arm_messages.COMMAND, self._on_command, qos.command())
@@ -146,7 +146,9 @@ class ArmNode(Shell):
             raise ConfigError(f"'{changed[0]}' cannot change while the arm is connected", next_step="Deactivate first")
 
     def heartbeat(self) -> None:
-        """Counters of the guard."""
+        """Counters of the guard; the flags again, for readers that came late and ask for new messages only."""
+        if self._closed is not None:
+            self._closed_out.publish(convert.closed_to_message(arm_messages.closed_flag(self._closed)))
         if self._arm is not None:
             for what, count in self._guard.counts.items():
                 self.diagnostics.value(f"count: {what}", str(count))

@@ -93,7 +93,7 @@ class PlannerNode(Shell):
         self._settings = load_settings(config.settings)
         scene = scene_with_slot(self._twin.scene, self._settings)
         self._dynamics = type(self).MAKE_DYNAMICS(self._twin, scene, config.device)
-        self._plan_out = self.create_publisher(MultiDOFJointTrajectory, PLAN_TRAJECTORY, qos.command())
+        self._plan_out = self.create_publisher(MultiDOFJointTrajectory, PLAN_TRAJECTORY, qos.plans())
         self._markers_out = self.create_publisher(MarkerArray, "~/markers", qos.latched()) if config.markers else None
         self.create_service(SetBool, "~/enable", self._on_enable)
         self.create_service(Trigger, "~/stop", self._on_stop)
@@ -305,6 +305,9 @@ class PlannerNode(Shell):
         if self._session.distance is not None:
             self.diagnostics.value("distance to the goal [mm]", f"{1e3 * self._session.distance:.1f}")
         if plan is None:
+            if self._session.waiting:
+                off = f"{1e3 * self._session.off:.0f} mm off its plan when last given up"
+                self.report(WARN, f"waiting until the arm rests; {off}")
             return
         with self._changed:
             if not self._enabled or self._ending:  # stopped meanwhile

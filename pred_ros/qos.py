@@ -11,6 +11,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 LIVE_DEPTH = 5
 LIVE_POSES = 50  # 0.1 s at 500 Hz: small, and every one of them moves the simulation
+PLANS_DEPTH = 10  # 0.2 s at 50 plans a second
 # Deep enough for the longest backlog of a scored replay (20 s at 500 Hz); memory follows what is queued.
 COMPLETE_DEPTH = 10_000
 
@@ -33,6 +34,11 @@ def points_complete() -> QoSProfile:
 def command() -> QoSProfile:
     """Commands: only the newest counts; the reader's watchdog judges its age."""
     return _profile(1, DurabilityPolicy.VOLATILE)
+
+
+def plans() -> QoSProfile:
+    """Plans: each continues the one before, so a reader that was busy for a moment must not miss one."""
+    return _profile(PLANS_DEPTH, DurabilityPolicy.VOLATILE)
 
 
 def images() -> QoSProfile:

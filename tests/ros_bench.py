@@ -48,7 +48,7 @@ class Bench:
         self.pose_out.publish(convert.pose_to_message(pose(frame)))
         self.points_out.publish(convert.points_to_cloud(points(frame)))
 
-    def until(self, condition: Callable[[], Any], what: str, limit: float = 20.0) -> None:
+    def until(self, condition: Callable[[], Any], what: str, limit: float = 60.0) -> None:
         """Spin until the condition holds; fail after `limit` [s]."""
         end = time.monotonic() + limit
         while not condition():

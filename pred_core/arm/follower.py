@@ -18,6 +18,7 @@ WORLD = "world"
 UNIT_TOLERANCE = 1e-3  # of a quaternion's norm, as in the bag contract
 OVER = 1.5  # a plan may ask for this times the speed limit between two points; the guard lags behind it
 REST = 1e-6  # [m], [rad] between the last two points of a plan that ends at rest
+MOST_WAITING = 100  # plans not yet begun
 
 
 @dataclass(frozen=True)
@@ -84,13 +85,16 @@ def make_plan(
 
 
 class Follower:
-    """Holds the plan in force and the next one, whose first point is not due yet."""
+    """Holds the plan in force and those whose first point is not due yet.
+
+    A planner may send plans faster than they begin; each begins where the one before will have brought the arm.
+    """
 
     def __init__(self, config: GuardConfig, lifetime: float):
         self._config = config
         self._lifetime = lifetime  # [s] after its stamp a plan is followed no more
         self._plan: Plan | None = None
-        self._next: Plan | None = None
+        self._waiting: list[Plan] = []  # by their beginning
 
     @property
     def plan(self) -> Plan | None:
@@ -99,21 +103,27 @@ class Follower:
 
     def clear(self) -> None:
         """Forget every plan."""
-        self._plan = self._next = None
+        self._plan, self._waiting = None, []
 
     def accept(self, plan: Plan, here: tuple[Array, Quaternion], now: int) -> None:
-        """Follow a plan from its first point on. `here`: the present set-point, `now` [ns].
+        """Follow a plan from its first point on, instead of those that would begin later. `here`: the present
+        set-point, `now` [ns].
 
-        Raises: InputError for a plan that is over, too old, or begins where the arm cannot be by then.
+        Raises: InputError for a plan that is over, too old, begins where the arm cannot be by then, or is one too many.
         """
         if plan.end <= now:
             raise InputError("plan lies in the past", got=f"it ended {(now - plan.end) / NS:.3f} s ago")
         if now - plan.start > self._lifetime * NS:
             raise InputError("plan is too old", got=f"{(now - plan.start) / NS:.3f} s", allowed=f"{self._lifetime:g} s")
         due = max(now, plan.begin)
-        old = self._plan.at(due) if self._plan is not None and self._plan.end > now else here
+        sooner = [p for p in self._waiting if p.begin < plan.begin]
+        if len(sooner) == MOST_WAITING:
+            raise InputError("too many plans wait to begin", got=MOST_WAITING + 1, allowed=MOST_WAITING)
+        before = sooner[-1] if sooner else self._plan
+        known = before is not None and before.end > now
+        old = before.at(due) if before is not None and known else here
         position, rotation = plan.at(due)
-        ahead = 0.0 if self._plan is not None and self._plan.end > now else (due - now) / NS
+        ahead = 0.0 if known else (due - now) / NS
         most = self._config.step + self._config.speed * ahead
         most_angle = self._config.angular_step + self._config.angular_speed * ahead
         off, angle = float(np.linalg.norm(position - old[0])), angle_between(old[1], rotation)
@@ -125,9 +135,9 @@ class Follower:
                 next_step="Plan from the measured gripper pose",
             )
         if plan.begin <= now or self._plan is None:
-            self._plan, self._next = plan, None
+            self._plan, self._waiting = plan, []
         else:
-            self._next = plan
+            self._waiting = [*sooner, plan]
 
     def target(self, now: int, lead: float) -> tuple[Array, Quaternion] | None:
         """The pose to ask for at `now` [ns], `lead` [s] ahead in the plan; None: nothing to ask for.
@@ -135,8 +145,8 @@ class Follower:
         None before the first plan begins, after a plan that does not end at rest, and when the plan is too old.
         """
         ask = now + round(lead * NS)
-        if self._next is not None and self._next.begin <= ask:
-            self._plan, self._next = self._next, None
+        while self._waiting and self._waiting[0].begin <= ask:
+            self._plan = self._waiting.pop(0)
         if self._plan is None or now - self._plan.start > self._lifetime * NS or ask < self._plan.begin:
             return None
         if ask > self._plan.end and not self._plan.ends_at_rest:
@@ -146,7 +156,7 @@ class Follower:
     def done(self, now: int) -> bool:
         """The plan in force ended at rest, and nothing follows it."""
         plan = self._plan
-        return plan is not None and self._next is None and plan.ends_at_rest and now >= plan.end
+        return plan is not None and not self._waiting and plan.ends_at_rest and now >= plan.end
 
 
 def _check_jumps(plan: Plan, config: GuardConfig) -> None:

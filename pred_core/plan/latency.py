@@ -14,6 +14,7 @@ import torch
 from pred_core.bag.align import slerp
 from pred_core.dynamics import Dynamics
 from pred_core.errors import DivergenceError, InputError
+from pred_core.plan.course import Course
 from pred_core.plan.knots import Beginning
 from pred_core.plan.plan import NS, Plan
 from pred_core.types import Array, Grip, State
@@ -62,11 +63,11 @@ class Departure:
     beginning: Beginning  # the grippers then
 
 
-def departure(dynamics: Dynamics, seen: Observation, begin: int, in_force: Plan | None) -> Departure:
+def departure(dynamics: Dynamics, seen: Observation, begin: int, in_force: Plan | Course | None) -> Departure:
     """The state and the grippers at `begin` [ns], rounded to whole periods after the observation, not before it.
 
-    The grippers go along the plan in force; where the measured pose is off it, the difference fades out linearly until
-    the plan begins. Without a plan they stay where they were measured.
+    The grippers go along the plan, or the course of plans, in force; where the measured pose is off it, the difference
+    fades out linearly until the plan begins. Without a plan they stay where they were measured.
 
     Raises: DivergenceError if the simulation leaves the finite numbers on the way.
     """
@@ -89,8 +90,8 @@ def departure(dynamics: Dynamics, seen: Observation, begin: int, in_force: Plan 
     return Departure(stamp, state, measured if in_force is None else in_force.at(stamp))
 
 
-def tracking_error(seen: Observation, in_force: Plan) -> float:
-    """[m] how far the farthest gripper is from where the plan in force has it at the observation's time."""
+def tracking_error(seen: Observation, in_force: Plan | Course) -> float:
+    """[m] how far the farthest gripper is from where what is in force has it at the observation's time."""
     return float(np.linalg.norm(seen.position - in_force.at(seen.stamp).position, axis=-1).max())
 
 

@@ -10,12 +10,16 @@ import numpy as np
 
 from pred_core.config import setting
 from pred_core.errors import InputError
+from pred_core.plan.course import Course
 from pred_core.plan.curve import Curve, first_knots
 from pred_core.plan.goal_cost import GoalCost
 from pred_core.plan.latency import Observation, tracking_error
 from pred_core.plan.plan import NS, Plan
 from pred_core.plan.planner import Planner
 from pred_core.types import Array
+
+STILL = 1e-3  # [m] grippers that stay within this
+RESTED = 0.1  # [s] for so long are at rest
 
 
 @dataclass(frozen=True)
@@ -34,8 +38,10 @@ class SessionCounts:
     """What happened so far; shown in the diagnostics."""
 
     plans: int = 0
+    fresh: int = 0  # of these, begun at the measured pose at rest; the others continue what was sent before
     late: int = 0  # found after they should have begun; dropped
-    off_track: int = 0  # plans in force given up because the arm did not follow
+    off_track: int = 0  # times the plans in force were given up because the arm did not follow
+    moving: int = 0  # observations not planned from: after giving up, the arm has to rest first
 
 
 class Session:
@@ -53,7 +59,10 @@ class Session:
         self._make, self._timing, self._now, self._clock = make, timing, now, clock
         self._planner: Planner | None = None
         self._warm = False
-        self.in_force: Plan | None = None
+        self._course = Course()
+        self._still: Observation | None = None  # since when the grippers have not moved
+        self._must_rest = False  # what the arm does is not known
+        self.off = 0.0  # [m] the arm was off its plan when it was last given up
         self.distance: float | None = None  # [m] chamfer distance of the last observation to the goal
         self.counts = SessionCounts()
 
@@ -61,6 +70,16 @@ class Session:
     def has_goal(self) -> bool:
         """A usable goal was given."""
         return self._planner is not None
+
+    @property
+    def in_force(self) -> Plan | None:
+        """The newest plan that was sent; the next one continues it."""
+        return self._course.newest
+
+    @property
+    def waiting(self) -> bool:
+        """Plans were given up and the arm still moves: where it will be is not known."""
+        return self._must_rest
 
     @property
     def reached(self) -> bool:
@@ -73,13 +92,14 @@ class Session:
         self._planner = self._make(points)
 
     def reset(self) -> None:
-        """Forget the plan in force and the last plan; the goal stays."""
-        self.in_force = self.distance = None
-        if self._planner is not None:
-            self._planner.reset()
+        """Forget the plans in force and the last plan; the goal stays. An arm under way must come to rest first."""
+        self.distance = None
+        self._give_up()
 
     def replan(self, seen: Observation) -> Plan | None:
-        """The next plan; `commit` it when it is sent. None: goal reached, plan too late, or the first, slow run.
+        """The next plan; `commit` it when it is sent. It continues what was sent before; after that was given up, or at
+        first, it begins at the measured pose at rest. None: goal reached, the arm must rest first, plan too late, or
+        the first, slow run.
 
         Raises: InputError for no goal, a bad or old observation, or an unsafe plan; DivergenceError.
         """
@@ -93,9 +113,10 @@ class Session:
         self.distance = self._goal_distance(seen)
         if self.reached:
             return None
-        if self.in_force is not None and tracking_error(seen, self.in_force) > self._timing.off_track:
-            self.counts.off_track += 1
-            self.reset()
+        self._check_arm(seen)
+        if self._must_rest:
+            self.counts.moving += 1
+            return None
         if not self._warm:  # the first rollout compiles kernels; the second one shows how long a chunk takes
             for _ in range(2):
                 self._planner.plan(seen, deadline=self._clock())
@@ -104,31 +125,53 @@ class Session:
             return None
         begin = self._now() + round((self._timing.budget + self._timing.margin) * NS)
         deadline = self._clock() + self._timing.budget
-        plan = self._planner.plan(seen, begin, in_force=self.in_force, deadline=deadline)
+        force = None if self.in_force is None else self._course
+        plan = self._planner.plan(seen, begin, in_force=force, deadline=deadline)
         if self._now() > plan.start:
             self.counts.late += 1
             return None
         return plan
 
     def commit(self, plan: Plan) -> None:
-        """A plan was sent: it is in force now."""
+        """A plan was sent: it is in force from its start on."""
         self.counts.plans += 1
-        self.in_force = plan
+        self.counts.fresh += self.in_force is None
+        self._course.add(plan, self._now() - round(self._timing.max_age * NS))
 
     def stop(self) -> Plan | None:
-        """The plan in force, ended as soon as it can be: within two knots after the margin. None: nothing moves."""
-        force, self.in_force = self.in_force, None
-        if self._planner is not None:
-            self._planner.reset()
-        stamp = self._now() + round(self._timing.margin * NS)
+        """What is carried out, ended as soon as it can be: within two knots after the margin. None: nothing moves."""
+        force, stamp = self.in_force, self._now() + round(self._timing.margin * NS)
         if force is None or force.end <= stamp:
+            self._give_up()
             return None
-        here, spacing = force.at(stamp), force.curve.spacing
+        here, spacing = self._course.at(stamp), force.curve.spacing
+        self._give_up()
         knots = np.zeros((4, *here.velocity.shape))
         knots[:2] = first_knots(here.velocity, here.acceleration, spacing)
         curve = Curve(spacing, here.position, here.rotation, knots)
         nothing = np.zeros((0, 0, 3))
         return Plan(stamp, curve, curve, 0.0, {}, 0.0, nothing, np.zeros(0), 0, 0, 0.0, 0)
+
+    def _give_up(self) -> None:
+        """No plan is in force; where an arm that had one will be is not known until it rests."""
+        self._must_rest |= self.in_force is not None
+        self._course.clear()
+        self._still = None
+        if self._planner is not None:
+            self._planner.reset()
+
+    def _check_arm(self, seen: Observation) -> None:
+        """Give up what the arm does not follow; notice when it rests."""
+        if self.in_force is not None:
+            off = tracking_error(seen, self._course)
+            if off > self._timing.off_track:
+                self.counts.off_track += 1
+                self.off = off
+                self._give_up()
+        if self._must_rest:
+            if self._still is None or _moved(seen, self._still):
+                self._still = seen
+            self._must_rest = (seen.stamp - self._still.stamp) / NS < RESTED
 
     def _goal_distance(self, seen: Observation) -> float | None:
         assert self._planner is not None
@@ -136,3 +179,10 @@ class Session:
             if isinstance(cost, GoalCost):
                 return float(cost.distance(seen.state.position))
         return None
+
+
+def _moved(now: Observation, before: Observation) -> bool:
+    """True if a gripper is elsewhere than before; turns alone matter little, a plan begins at the turn measured."""
+    if now.position.shape != before.position.shape:
+        return True
+    return bool(np.linalg.norm(now.position - before.position, axis=-1).max() > STILL)
