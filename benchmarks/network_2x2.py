@@ -41,12 +41,13 @@ from pred_core.types import Array
 
 # Without carrying on: on 30 Hz tracks with millimetres of noise a window starts from data. Wider: a bad base needs it.
 ROPE = shlex.split(
-    "--no-azimuth --rollout 15 --batch 16 --stride 2 --cap 0.3 --penalty 0.01 --average 0.99 --evaluate-every 100 "
-    "--arc-frequencies 3 --encoder-layers 2 --feature 32 --embedding 32 --feedforward 64 --encoder-feedforward 64"
+    "--no-guard --no-azimuth --rollout 15 --batch 16 --stride 2 --cap 0.3 --penalty 0.01 --average 0.99 "
+    "--evaluate-every 100 --arc-frequencies 3 --encoder-layers 2 --feature 32 --embedding 32 --feedforward 64 "
+    "--encoder-feedforward 64"
 )
-WIDE = [*TRAIN, "--cap", "0.1", "--penalty", "0.01"]
+WIDE = [*TRAIN, "--no-guard", "--cap", "0.1", "--penalty", "0.01"]
 SETTINGS: dict[str, dict[str, list[str]]] = {
-    "cable": {"tight": TRAIN, "wide": WIDE},
+    "cable": {"tight": [*TRAIN, "--no-guard"], "wide": WIDE},
     "case": {"long": ROPE, "short": [*ROPE, "--rollout", "5"]},
 }
 BACKBONES = ("base", "extended")
@@ -88,7 +89,7 @@ def main() -> int:
     for split, errors in tables.items():
         print("\n".join(markdown(split, errors)), flush=True)
     out = args.out if args.kind == "case" else args.out / args.cable
-    write_json(out / "network.json", {s: {k: float(v.mean()) for k, v in e.items()} for s, e in tables.items()})
+    write_json(out / "network.json", {s: {k: summary(v) for k, v in e.items()} for s, e in tables.items()})
     write_json(out / "network_episodes.json", {s: {k: v.tolist() for k, v in e.items()} for s, e in tables.items()})
     return 0
 
@@ -184,17 +185,23 @@ def markdown(split: str, errors: Errors) -> list[str]:
     return lines
 
 
+def summary(values: Array) -> dict[str, float]:
+    """Mean and 95 % over episodes."""
+    low, high = bootstrap_interval(values, np.random.default_rng(0))
+    return {"mean": float(values.mean()), "low": low, "high": high}
+
+
 def shown(values: Array) -> str:
     """Mean, 95 % over episodes, median."""
-    low, high = bootstrap_interval(values, np.random.default_rng(0))
-    return f"{values.mean():.2f} [{low:.2f}, {high:.2f}] / {np.median(values):.2f}"
+    s = summary(values)
+    return f"{s['mean']:.2f} [{s['low']:.2f}, {s['high']:.2f}] / {np.median(values):.2f}"
 
 
 def difference(before: Array, after: Array) -> str:
     """Mean paired difference, 95 % over episodes, how many improve."""
     gain = before - after
-    low, high = bootstrap_interval(gain, np.random.default_rng(0))
-    return f"{gain.mean():.2f} [{low:.2f}, {high:.2f}], {int((gain > 0).sum())} of {len(gain)}"
+    s = summary(gain)
+    return f"{s['mean']:.2f} [{s['low']:.2f}, {s['high']:.2f}], {int((gain > 0).sum())} of {len(gain)}"
 
 
 if __name__ == "__main__":

@@ -178,7 +178,8 @@ def test_a_report_opens_with_its_sentence_and_has_every_section(
     assert (d.next_motion is not None) == (outcome in ("named", "group"))
     known = recorded(twin, (), ("train",) * 3, seed=90) if outcome == "named" else None
     path = tmp_path / "report.html"
-    network = {"test": {"base": 12.0, "base + network": 7.0, "extended": 3.0, "extended + network": 2.5}}
+    means = {"base": 12.0, "base + network": 7.0, "extended": 3.0, "extended + network": 2.5}
+    network = {"test": {cell: {"mean": m, "low": m - 1.0, "high": m + 1.0} for cell, m in means.items()}}
     write_report(path, d, dragged, known, "pred diagnose <data>", network if outcome == "group" else None)
     text = path.read_text("utf-8")
     assert text.index(d.sentence) < text.index("<h2>")
@@ -188,7 +189,7 @@ def test_a_report_opens_with_its_sentence_and_has_every_section(
     assert "measured, corrected" not in text
     assert "pred diagnose &lt;data&gt;" in text and "src=\"http" not in text
     assert ("reference's episodes" in text.replace("&#x27;", "'")) == (known is not None)
-    assert ("<td>2.5</td>" in text) == (outcome == "group")
+    assert ("<td>2.5 [1.5, 3.5]</td>" in text) == (outcome == "group")
     assert ("nothing is named" in text) == (outcome in ("none", "unknown"))
     if outcome == "group":
         assert "do not tell air drag from quadratic air drag" in text

@@ -43,7 +43,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def command(case: Path, out: Path, *extra: str) -> list[str]:
-    return ["train", str(case / "data"), "--twin", str(case / "twin"), "--out", str(out), *extra]
+    return ["train", str(case / "data"), "--twin", str(case / "twin"), "--out", str(out), "--no-guard", *extra]
 
 
 def start(arguments: list[str]) -> subprocess.Popen[str]:

@@ -11,15 +11,18 @@ from pathlib import Path
 
 from pred_core.bag.dataset import Dataset, load_dataset
 from pred_core.cli.checks import warn_of_another_object
+from pred_core.cli.network_guard import question, question_or_say
 from pred_core.cli.settings import add_settings, given_settings, read_settings
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.motion_file import write_motion
 from pred_core.diagnose.report import write_report
+from pred_core.diagnose.report_network import read_network
 from pred_core.diagnose.result import Diagnosis
 from pred_core.diagnose.run import diagnose
 from pred_core.evaluate.report import write_json
 from pred_core.twin import Twin
+from pred_core.types import Episode
 
 NAME = "diagnose"
 HELP = "find what a twin's simulation gets wrong, name the cause, extend the twin and measure the gain"
@@ -32,6 +35,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference", type=Path, default=None, metavar="DATASET",
                         help="data set of the same object without the effect: the change is diagnosed")
     parser.add_argument("--out", type=Path, required=True, help="output folder; an interrupted run goes on there")
+    parser.add_argument("--guard", action="store_true",
+                        help="only ask whether the twin's network hides a cause: guard.json and guard.html")
+    parser.add_argument("--network", type=Path, default=None, metavar="FILE",
+                        help="errors with and without a network to show in the report (benchmarks/network_2x2.py)")
     add_settings(parser, DiagnoseConfig)
 
 
@@ -42,6 +49,11 @@ def run(args: argparse.Namespace) -> int:
     dataset = load_dataset(args.dataset)
     twin = Twin.load(args.twin)
     warn_of_another_object(twin, dataset, str(args.twin))
+    if args.guard:
+        lines = question(twin, _unseen(dataset), args.out, args.dataset, args.twin)[1]
+        print("\n".join([*lines, str(args.out / "guard.html")]))
+        return 0
+    network = None if args.network is None else read_network(args.network)
     reference = None if args.reference is None else load_dataset(args.reference)
     journal = Journal(args.out / "journal.jsonl", _header(dataset, reference, twin, config))
     tell = _Progress(begin)
@@ -53,12 +65,20 @@ def run(args: argparse.Namespace) -> int:
     answer.twin.replace(meta=meta).save(args.out / "twin")
     write_json(args.out / "diagnosis.json", {**answer.to_json(), "command": command})
     _write_next_motion(args.out / "next_motion.yaml", answer)
-    write_report(args.out / "report.html", answer, episodes, known, command)
+    guard = None
+    if twin.residual is not None:
+        guard = question_or_say(twin, _unseen(dataset), args.out, args.dataset, args.twin, tell)
+    write_report(args.out / "report.html", answer, episodes, known, command, network, guard)
     print(answer.sentence)
     for row in answer.ranking[:5]:
         print(f"  {row.probability:5.2f}  {row.id:24s} {row.rejected}")
     print(f"{args.out / 'report.html'}  {args.out / 'diagnosis.json'}  {args.out / 'twin'}  ({answer.seconds:.0f} s)")
     return 0
+
+
+def _unseen(dataset: Dataset) -> list[Episode]:
+    """Episodes that a network is questioned on: those of the motions it is for."""
+    return [e for e in dataset.episodes() if e.split != "ood"]
 
 
 def _write_next_motion(path: Path, answer: Diagnosis) -> None:
@@ -83,6 +103,8 @@ def _words(args: argparse.Namespace) -> list[str]:
     words = ["diagnose", str(args.dataset), "--twin", str(args.twin), "--out", str(args.out)]
     if args.reference is not None:
         words += ["--reference", str(args.reference)]
+    if args.network is not None:
+        words += ["--network", str(args.network)]
     return [*words, *given_settings(args, DiagnoseConfig)]
 
 

@@ -18,6 +18,7 @@ import torch
 
 from pred_core.bag.dataset import Dataset, load_dataset
 from pred_core.cli.checks import warn_of_another_object
+from pred_core.cli.network_guard import question_or_say
 from pred_core.config import from_mapping
 from pred_core.errors import ConfigError
 from pred_core.pred import load_base
@@ -45,6 +46,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the output twin")
     parser.add_argument("--restart", action="store_true", help="throw that checkpoint away")
     parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
+    parser.add_argument("--guard", action=argparse.BooleanOptionalAction, default=True,
+                        help="ask afterwards whether the network hides a cause that the simulation lacks (guard.json)")
     text = f"time between checkpoints [s] (default: {CHECKPOINT_SECONDS:g})"
     parser.add_argument("--checkpoint-seconds", type=float, default=CHECKPOINT_SECONDS, help=text)
     for title, config in (("training", TrainingConfig), ("network", ResidualConfig)):
@@ -79,12 +82,17 @@ def run(args: argparse.Namespace) -> int:
     command = shlex.join(["pred", "train", *files, *_flags(training), *_flags(network)])
     data = tuple(dict.fromkeys((*twin.meta.data, *hashes)))  # the backbone's bags count as seen too
     meta = dataclasses.replace(twin.meta, created_by=command, parent=source["twin"], data=data)
-    twin.replace(residual=trainer.chosen().weights(), meta=meta).save(out)
+    twin = twin.replace(residual=trainer.chosen().weights(), meta=meta)
+    twin.save(out)
     write_report(out, trainer.summary(), command)
     checkpoint.unlink()
     if trainer.best_step == 0:
         _tell("kept the first weights: no step beat the backbone on held-out recordings; train longer or use more data")
     _tell(f"wrote {out} and {out / 'train.html'}")
+    if args.guard:
+        kept = {r.name for r in (*trainer.fit, *trainer.held_out)}
+        trained_on = [e for e in dataset.episodes("train") if e.name in kept]
+        question_or_say(twin, trained_on, out, args.dataset, out, _tell)
     return 0
 
 

@@ -1,7 +1,7 @@
 """The network must not hide causes: what of its force would a cause of the library have made?
 
-The twin is rolled out with its network. Beside every step each candidate cause is switched on a little in the same
-state; what one period then adds to the velocities is a column, what the network adds is the other side. A family of
+The twin is rolled out with its network. Beside a step each candidate cause is switched on for one period in the same
+state; where that leads is a column, where the network's velocity of that step leads is the other side. A family of
 causes that explains more than `OPEN` of the network's variance, on recordings that the regression did not see,
 reopens the case: a law that the simulation lacks is hidden in the weights.
 """
@@ -117,7 +117,7 @@ def guard_of(model: PReD, twin: Twin, episodes: Sequence[Episode], seed: int = 0
         reopened.append(best)
         known += gains[best]
     alike = tuple(f for f in passing if f not in reopened)
-    return Guard(tuple(families), joint, tuple(reopened), alike, m.speed, twin.meta.period, len(taken),
+    return Guard(tuple(families), joint, tuple(reopened), alike, path.speed, twin.meta.period, len(taken),
                  len(m.groups), probes.untested)  # fmt: skip
 
 

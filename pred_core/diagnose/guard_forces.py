@@ -1,4 +1,8 @@
-"""What the network adds, step by step, and what each candidate cause would have added in the same states."""
+"""What the network adds, step by step, and what each candidate cause would have added in the same states.
+
+Both are measured by what they do to the positions a little later: a push that the springs undo at once, and there are
+many in the output of a network on a stiff object, moves nothing and counts for nothing.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,8 @@ from pred_core.springmass.arrays import chains
 from pred_core.twin import Extension, Twin
 from pred_core.types import Array, Grip, State
 
-MOST_STATES = 6000  # (world, step) pairs that are compared
+MOST_STATES = 3000  # (world, step) pairs that are compared
+LATER = 0.1  # [s] after which the positions are compared
 
 
 @dataclass(frozen=True)
@@ -33,17 +38,23 @@ class Path:
     added: Tensor  # (K, W, N, 3) [m/s] the network's velocity
     counts: Tensor  # (K, W, N) bool: free, measured in the episode, finite
 
+    @property
+    def speed(self) -> float:
+        """[m/s] root mean square over particles of what the network adds in a step."""
+        return float(self.added[self.counts].square().sum(dim=-1).mean().sqrt())
+
 
 @dataclass(frozen=True)
 class Moments:
-    """Sums of products over all that counts, for least squares: column p < P is a probe's velocity, the last the
-    network's. A probe's velocity is what one period adds with it, minus without.
+    """Sums of products over all that counts, for least squares: column p < P is a probe's, the last the network's.
+
+    A column is where free particles are `LATER` if one period is with the probe, or ends with the network's velocity,
+    minus where they are without; no network acts after that.
     """
 
-    products: Array  # (G, P + 1, P + 1) [m^2/s^2]
+    products: Array  # (G, P + 1, P + 1) [m^2]
     groups: tuple[int, ...]  # (G,) recording of each
-    values: int  # free particles' velocities that were compared
-    speed: float  # [m/s] root mean square of the network's velocity a particle
+    values: int  # free particles' places that were compared
 
 
 def backbone(
@@ -100,25 +111,39 @@ def moments(path: Path, roller: Roller, probes: Probes) -> Moments:
     groups = tuple(sorted(set(sample.groups.tolist())))
     group = torch.tensor([groups.index(int(sample.groups[e])) for e in sample.episode.tolist()])
     products = torch.zeros(len(groups), number, number, dtype=torch.float64)
+    onward = backbone(twin, probes.standing, substeps)
+    ahead = min(max(1, round(LATER / twin.meta.period)), len(path.states) - 1)
     every = max(1, math.ceil(len(path.states) * width / MOST_STATES))
-    shared = _shared_memory(twin)
+    shared, values = _shared_memory(twin), 0
     memory: Tensor | None = None
-    for k, state in enumerate(path.states):
+    for k, state in enumerate(path.states[:-ahead]):
         started, grips = _started(simulator, state, sample.windows.grips.at(k), number, memory)
         after = simulator.step(started, grips)
         memory = after.memory["effects"].unflatten(0, (number, width)).clone()
         memory[:, :, :shared] = memory[:1, :, :shared]
-        if k % every == every - 1:
-            velocity = after.velocity.unflatten(0, (number, width))
-            columns = torch.cat((velocity[1:] - velocity[:1], path.added[k][None]))  # (P + 1, W, N, 3)
+        if k % every == 0:
+            begin = _with_network(after, path.added[k], twin.meta.period)
+            coming = sample.windows.grips.span(k + 1, k + 1 + ahead)
+            coming = Grip(*(_tiled(v, number + 1, 1) for v in (coming.position, coming.rotation, coming.closed)))
+            place = onward.rollout(begin, coming)[-1].unflatten(0, (number + 1, width))
+            columns = place[1:] - place[:1]  # (P + 1, W, N, 3), the network last
             finite = torch.isfinite(columns).all(dim=0).all(dim=(-1, -2))
-            mask = path.counts[k] & finite[:, None]
+            mask = path.counts[k] & path.counts[k + ahead] & finite[:, None]
             rows = torch.where(mask[None, ..., None], columns, 0.0).double().movedim(1, 0).flatten(2)
             products.index_add_(0, group, rows @ rows.mT)
-    taken = path.counts[every - 1 :: every]
-    values = int(taken.sum())
-    speed = math.sqrt(float(products[:, -1, -1].sum()) / max(values, 1))
-    return Moments(np.asarray(products.numpy()), groups, values, speed)
+            values += int(mask.sum())
+    return Moments(np.asarray(products.numpy()), groups, values)
+
+
+def _with_network(after: State, added: Tensor, period: float) -> State:
+    """The worlds of all probes, and after them those without a probe and with the network's velocity `added`."""
+    plain = slice(0, len(added))
+    return State(
+        torch.cat((after.position, after.position[plain] + added * period)),
+        torch.cat((after.velocity, after.velocity[plain] + added)),
+        torch.cat((after.held, after.held[plain])),
+        {k: torch.cat((v, v[plain])) for k, v in after.memory.items()},
+    )
 
 
 def _started(
@@ -126,18 +151,20 @@ def _started(
 ) -> tuple[State, Grip]:
     """`state` (W, ...) in `number` copies, probe by probe, and the grip at the end of the step."""
 
-    def tiled(values: Tensor) -> Tensor:
-        return values.repeat(number, *[1] * (values.dim() - 1))
-
-    grips = Grip(*(tiled(v) for v in (grip.position, grip.rotation, grip.closed)))
-    kept = {k: tiled(v) for k, v in state.memory.items() if k != "effects"}
-    plain = State(tiled(state.position), tiled(state.velocity), tiled(state.held))
+    grips = Grip(*(_tiled(v, number) for v in (grip.position, grip.rotation, grip.closed)))
+    kept = {k: _tiled(v, number) for k, v in state.memory.items() if k != "effects"}
+    plain = State(_tiled(state.position, number), _tiled(state.velocity, number), _tiled(state.held, number))
     if memory is None:
         before = Grip(*(kept[f"grip_{k}"] for k in ("position", "rotation", "closed")))
         effects = simulator.start(plain, before).memory["effects"]
     else:
         effects = memory.flatten(0, 1)
     return plain.replace(memory={**kept, "effects": effects}), grips
+
+
+def _tiled(values: Tensor, number: int, dim: int = 0) -> Tensor:
+    """`number` copies after each other along `dim`."""
+    return values.repeat(*[1] * dim, number, *[1] * (values.dim() - dim - 1))
 
 
 def _shared_memory(twin: Twin) -> int:

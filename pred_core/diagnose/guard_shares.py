@@ -1,7 +1,7 @@
-"""How much of the network's velocity a family of causes explains, on recordings it was not fitted to.
+"""How much of what the network does a family of causes explains, on recordings it was not fitted to.
 
-share = 1 - sum |v - A b|^2 / sum |v|^2 over all recordings, b fitted on the others. Its null: the network's velocity
-with a random sign for every recording, so that a law that holds in one does not hold in another.
+share = 1 - sum |y - A b|^2 / sum |y|^2 over all recordings, b fitted on the others; y, A: columns of `Moments`. Its
+null: y with a random sign for every recording, so that a law that holds in one does not hold in another.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FLIPS = 256
 DRAWS = 2000
 MOST_FOLDS = 12
 RIDGE = 1e-3  # of a column's own square: breaks ties of columns that are alike
-QUIET = 1e-6  # [m/s] a column's usual size: below, the motions do not excite it
+QUIET = 1e-6  # [m] a column's usual size: below, the motions do not excite it
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Share:
     """A family, alone."""
 
     family: str
-    share: float  # of the variance of the network's velocity
+    share: float  # of the variance of what the network does
     low: float  # 95 % interval over recordings
     high: float
     p: float  # family-wise: of as large a share of any family under random signs
@@ -86,7 +86,7 @@ def together(m: Moments, probes: Sequence[Probe], families: Sequence[str]) -> fl
 
 
 def cross_fitted(products: Array, model: Model, flips: Array) -> Array:
-    """(F, G) squared error on each recording; `flips` (F, G) are the signs of the network's velocity."""
+    """(F, G) squared error on each recording; `flips` (F, G) are the signs of y."""
     groups = len(products)
     folds = [np.arange(n, groups, min(groups, MOST_FOLDS)) for n in range(min(groups, MOST_FOLDS))]
     result = np.empty((len(flips), groups))

@@ -11,7 +11,9 @@ from pred_core.calibration import Calibration
 from pred_core.diagnose import pictures, pictures_map, pictures_motion
 from pred_core.diagnose import report_parts as parts
 from pred_core.diagnose.errors import predicted
+from pred_core.diagnose.guard import Guard
 from pred_core.diagnose.map import WINDOW, Replay, replay
+from pred_core.diagnose.report_network import Network, add_network
 from pred_core.diagnose.result import Diagnosis
 from pred_core.evaluate.style import INK
 from pred_core.report import Page, Track, animation
@@ -26,9 +28,11 @@ def write_report(
     episodes: Sequence[Episode],
     reference: Sequence[Episode] | None,
     command: str,
-    network: parts.Network | None = None,
+    network: Network | None = None,
+    guard: Guard | None = None,
 ) -> None:
-    """Write the file. `episodes`, `reference`: as recorded, nothing corrected. `network`: errors with one, if known.
+    """Write the file. `episodes`, `reference`: as recorded, nothing corrected. `network`: errors with one, if known;
+    `guard`: what the questioned twin's own network does, if it has one.
 
     Raises: DatasetError if an episode is too short to be replayed.
     """
@@ -45,7 +49,7 @@ def write_report(
     parts.add_gate(page, answer)
     parts.add_open_questions(page, answer)
     pictures_motion.add_next_motion(page, answer)
-    parts.add_network(page, network)
+    add_network(page, network, guard)
     page.heading("How it was made")
     page.code(command)
     made = f"{answer.seconds:.0f} s; seed {answer.seed}. The extended twin stands beside this file in twin/."

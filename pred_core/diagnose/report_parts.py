@@ -18,9 +18,7 @@ from pred_core.effects import LIBRARY
 from pred_core.evaluate.bootstrap import bootstrap_interval
 from pred_core.report import Page, number
 
-Network = Mapping[str, Mapping[str, float]]  # split -> {"base", "base + network", "extended", "extended + network"} mm
 MOST_PARAMETERS = 6  # of a cause in the summary; a profile has many
-CELLS = ("base", "base + network", "extended", "extended + network")
 
 
 def words(id: str) -> str:
@@ -232,18 +230,3 @@ def add_open_questions(page: Page, d: Diagnosis) -> None:
     page.table(("no data of this kind tells",), [(line,) for line in d.not_identifiable])
     if d.not_testable:
         page.table(("not testable with these motions", "why"), [(words(k), v) for k, v in d.not_testable.items()])
-
-
-def add_network(page: Page, network: Network | None) -> None:
-    """Base and extended, each without and with a network."""
-    page.heading("With and without a network")
-    if network is None:
-        page.text(
-            "No network is part of this answer: it is trained on the extended twin after the causes are named, so that "
-            "it cannot hide them. Base and extended, each with and without one, are compared by:"
-        )
-        page.code("pred train DATASET --twin DIR/twin")
-        page.code("pred evaluate DATASET --twin DIR/twin --out EVALUATION")
-        return
-    rows = [(split, *(number(cells.get(c)) for c in CELLS)) for split, cells in network.items()]
-    page.table(("episodes", *(f"{c} [mm]" for c in CELLS)), rows)
