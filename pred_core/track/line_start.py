@@ -17,6 +17,9 @@ from pred_core.types import Array
 MAX_VOXELS = 20000  # more is not a line object but a mask that lets everything through
 CHROMA = 0.08  # difference in share of red, green or blue that parts two things that touch
 MOST_OF_IT = 0.99
+SIDEWAYS = 0.7  # of a piece behind a hole, to the way ahead
+LEAST_CELLS = 3  # of a piece behind a hole
+MOSTLY = 0.9  # of its cells lie ahead and have the line's colour
 THIN = 90  # percent of a line's points that are near to its middle
 
 
@@ -26,6 +29,7 @@ class LineStartConfig:
 
     voxel: float = setting(0.006, unit="m", low=1e-3, high=0.05, doc="resolution of the search")
     link: float = setting(0.016, unit="m", low=1e-3, high=0.2, doc="largest hole that is bridged along the line")
+    bridge: float = setting(0.12, unit="m", low=0.0, high=0.5, doc="longest hole in the depth between pieces of it")
     shortest: float = setting(0.1, unit="m", low=0.01, high=5.0, doc="of a line object")
     slenderness: float = setting(6.0, low=1.0, high=1000.0, doc="least length over thickness")
 
@@ -68,25 +72,78 @@ def _find(points: Array, color: NDArray[np.uint8], config: LineStartConfig) -> F
     pairs = pairs[apart < CHROMA]
     if not len(pairs):
         return None
+    _, label = connected_components(_graph(cells, pairs), directed=False)
+    best: _Piece | None = None
+    for piece in np.flatnonzero(np.bincount(label) * config.voxel >= 0.5 * config.shortest):
+        made = _piece(cells, pairs, np.flatnonzero(label == piece), config)
+        if made is not None and made.slenderness >= (config.slenderness if best is None else best.slenderness):
+            best = made
+    while best is not None and (bridge := next_piece(cells, chroma, label, best, config)) is not None:
+        pairs = np.concatenate((pairs, [bridge]))
+        label[label == label[bridge[1]]] = label[bridge[0]]
+        longer = _piece(cells, pairs, np.flatnonzero(label == label[bridge[0]]), config)
+        if longer is None or longer.length <= best.length:
+            break
+        best = longer
+    return None if best is None else FoundLine(best.path, np.isin(owner, best.part), best.length)
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A connected thing that may be the line, or a part of it."""
+
+    part: NDArray[np.int64]  # its cells
+    path: Array  # (K, 3) [m]
+    length: float  # [m]
+    slenderness: float
+
+
+def _piece(cells: Array, pairs: NDArray[np.int64], part: NDArray[np.int64], config: LineStartConfig) -> _Piece | None:
+    path = _order(cells[part], _graph(cells, pairs)[part][:, part], config)
+    if path is None:
+        return None
+    total = float(np.linalg.norm(np.diff(path, axis=0), axis=-1).sum())
+    spread = float(np.percentile(cKDTree(path).query(cells[part])[0], THIN))
+    slender = total / max(2.0 * spread, config.voxel)
+    return _Piece(part, path, total, slender) if total >= config.shortest else None
+
+
+def _graph(cells: Array, pairs: NDArray[np.int64]) -> csr_matrix:
     # The square makes many short steps cheaper than one long: paths follow the line and do not cut its bends.
     length = np.linalg.norm(cells[pairs[:, 0]] - cells[pairs[:, 1]], axis=-1)
-    graph = coo_matrix((length**2, (pairs[:, 0], pairs[:, 1])), shape=(len(cells),) * 2).tocsr()
-    _, label = connected_components(graph, directed=False)
-    best: FoundLine | None = None
-    most = 0.0
-    for component in range(int(label.max()) + 1):
-        part = np.flatnonzero(label == component)
-        if len(part) * config.voxel < 0.5 * config.shortest:
-            continue
-        path = _order(cells[part], graph[part][:, part], config)
-        if path is None:
-            continue
-        total = float(np.linalg.norm(np.diff(path, axis=0), axis=-1).sum())
-        spread = float(np.percentile(cKDTree(path).query(cells[part])[0], THIN))
-        slender = total / max(2.0 * spread, config.voxel)
-        if total >= config.shortest and slender >= max(config.slenderness, most):
-            best, most = FoundLine(path, np.isin(owner, part), total), slender
-    return best
+    return coo_matrix((length**2, (pairs[:, 0], pairs[:, 1])), shape=(len(cells),) * 2).tocsr()
+
+
+def next_piece(
+    cells: Array, chroma: Array, label: NDArray[np.int32], line: _Piece, config: LineStartConfig
+) -> tuple[int, int] | None:
+    """(cell of the line, cell beyond one of its ends) where the line goes on behind a hole in the depth; None: nowhere.
+
+    What goes on has the line's colour, at least three cells, and lies ahead, the part of it that is
+    near at least.
+    """
+    tone = np.median(chroma[line.part], axis=0)
+    alike = np.abs(chroma - tone).max(axis=-1) < CHROMA
+    mine = np.zeros(len(cells), bool)
+    mine[line.part] = True
+    found: list[tuple[float, tuple[int, int]]] = []
+    for end, inner in ((line.path[0], line.path[min(3, len(line.path) - 1)]), (line.path[-1], line.path[-4:][0])):
+        ahead = (end - inner) / max(float(np.linalg.norm(end - inner)), 1e-9)
+        away = cells - end
+        along = away @ ahead
+        aside = np.linalg.norm(away - along[:, None] * ahead, axis=-1)
+        inside = (along > 0.0) & (aside <= np.maximum(SIDEWAYS * along, 2.0 * config.voxel)) & alike
+        far = np.linalg.norm(away, axis=-1)
+        near = inside & ~mine & (far < config.bridge)
+        for other in np.unique(label[near]):
+            those = label == other
+            first = those & (far < far[those].min() + config.bridge)
+            if those.sum() >= LEAST_CELLS and inside[first].mean() > MOSTLY:
+                begin = np.flatnonzero(near & those)
+                nearest = int(begin[np.argmin(along[begin])])
+                root = int(line.part[np.argmin(np.linalg.norm(cells[line.part] - cells[nearest], axis=-1))])
+                found.append((float(along[nearest]), (root, nearest)))
+    return min(found)[1] if found else None
 
 
 def resample(path: Array, count: int) -> Array:

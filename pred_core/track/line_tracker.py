@@ -30,6 +30,7 @@ Poses = tuple[Array, Array]
 WIDTH_OF_UNIFORM = np.sqrt(3.0)  # half width over standard deviation of points spread evenly over a width
 OBSTACLE = 0.015  # [m] before a node, beyond errors of depth and of the fit
 SAME_TIME = 10_000_000  # [ns]
+GROWN = 0.03  # of the length: less is noise
 STILL = 0.005  # [m] standard deviation of the motion prior of a particle in view, beside its acceleration
 
 
@@ -49,6 +50,7 @@ class LineConfig:
     lost: float = setting(0.5, low=0.0, high=1.0, doc="share of the points on the line below which it is lost")
     patience: float = setting(0.4, unit="s", low=0.0, high=10.0, doc="how long before it is searched anew")
     tolerance: float = setting(0.15, low=0.01, high=1.0, doc="relative difference of length when it is found again")
+    growing: float = setting(1.0, unit="s", low=0.0, high=60.0, doc="for how long a measured length may still grow")
     fit: LineFitConfig = LineFitConfig()
     start: LineStartConfig = LineStartConfig()
     grasp: GraspConfig = GraspConfig()
@@ -66,6 +68,8 @@ class LineTracker:
         self.velocity: Array = np.zeros((config.particles, 3))
         self._variance: Array = np.zeros(config.particles)  # (N,) [m^2] of the prediction
         self._bad_since: int | None = None
+        self._pulled = False  # a gripper that it has slipped out of has pulled the nodes along
+        self._found_at: int | None = None  # [ns] when its length was measured
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
 
     @property
@@ -76,10 +80,19 @@ class LineTracker:
     def start(self, views: Sequence[View], stamp: int, poses: Poses | None, closed: NDArray[np.bool_]) -> list[View]:
         """Look for the line. Returns the part of each view that is on it; nothing if it is not found."""
         found = _find(views, self.config.start)
-        if found is None:
-            return []
+        return [] if found is None else self._begin(found, views, stamp, poses, closed, self.length > 0.0)
+
+    def _begin(
+        self,
+        found: FoundLine,
+        views: Sequence[View],
+        stamp: int,
+        poses: Poses | None,
+        closed: NDArray[np.bool_],
+        known: bool,
+    ) -> list[View]:
+        """Nodes along what was found, of the `known` length or of the one they then have."""
         path = self._oriented(found.path, poses, closed)
-        known = self.length > 0.0
         cuts = np.cumsum([len(v.pixel) for v in views])[:-1]
         members = [v.select(m) for v, m in zip(views, np.split(found.member, cuts), strict=True)]
         nodes = resample(path, self.config.particles)
@@ -89,7 +102,9 @@ class LineTracker:
         nodes, length = _settle(nodes, cloud, radius, self.config, self.length if known else None, ends)
         if known and abs(length - self.length) > self.config.tolerance * self.length:
             return []
-        self.length = self.length if known else length
+        if not known:
+            self.length = length
+            self._found_at = stamp if self._found_at is None else self._found_at
         self.radius, self.nodes, self.stamp = radius, nodes, stamp
         self.velocity = np.zeros_like(nodes)
         self._variance = np.full(len(nodes), STILL**2)
@@ -107,6 +122,7 @@ class LineTracker:
         """Follow the line to `stamp` [ns]. `prior` is used instead of constant velocity."""
         assert self.nodes is not None  # `start` has succeeded; the caller's bug otherwise
         cameras = tuple(v.camera for v in views)
+        self._grow(views, stamp, poses)
         dt = max((stamp - self.stamp) * 1e-9, 0.0)
         expected, sigma = self._predict(dt, stamp, poses, prior)
         information = np.eye(3) / (sigma**2)[:, None, None]
@@ -114,6 +130,10 @@ class LineTracker:
         if self.grasp.watch(place, np.concatenate([v.points for v in views]), stamp):
             self.grasp.release()
             held, place = self.grasp.targets(poses)
+            self._pulled = True
+        if self._pulled and (anew := self._anew(views, poses)) is not None:
+            expected, self.nodes, self.velocity, self._pulled = anew.copy(), anew, np.zeros_like(anew), False
+            information = np.tile(np.eye(3) / self.config.fit.reach**2, (len(anew), 1, 1))
         information[held] = np.eye(3) / self.config.grasp.sigma**2
         expected[held] = place
         cloud = self._cloud([_near(v, expected, self.config.fit.reach) for v in views], stamp, self.radius)
@@ -134,6 +154,22 @@ class LineTracker:
         self.stamp = stamp
         return self._estimate(fit, visible, self._judge(fit, views, stamp), cameras)
 
+    def _grow(self, views: Sequence[View], stamp: int, poses: Poses | None) -> None:
+        """The first pictures may have missed an end: start again where a later one shows more of the line."""
+        if self._found_at is None or (stamp - self._found_at) * 1e-9 > self.config.growing:
+            return
+        found = _find(views, self.config.start)
+        if found is None or found.length < (1.0 + GROWN) * self.length or not self._is_on(found.path):
+            return
+        self._begin(found, views, stamp, poses, self._closed, known=False)
+
+    def _is_on(self, path: Array) -> bool:
+        """Whether the nodes lie on a path (K, 3)."""
+        assert self.nodes is not None
+        dense = resample(path, 4 * len(path))
+        away = np.linalg.norm(self.nodes[:, None] - dense[None], axis=-1).min(axis=1)
+        return bool(np.median(away) < self.config.fit.reach)
+
     def _ends_in_tools(self, nodes: Array, poses: Poses | None, closed: NDArray[np.bool_]) -> Anchors:
         """A held end is in the tool centre, which the jaws hide."""
         target, information = nodes.copy(), np.zeros((len(nodes), 3, 3))
@@ -148,16 +184,22 @@ class LineTracker:
         self, fit: LineFit, score: float, views: Sequence[View], stamp: int, poses: Poses | None
     ) -> LineFit:
         """A fit from scratch, if it explains the pictures better than the one that followed the motion."""
-        found = _find(views, self.config.start)
-        if found is None or abs(found.length - self.length) > self.config.tolerance * self.length:
+        nodes = self._anew(views, poses)
+        if nodes is None:
             return fit
-        nodes = resample(self._oriented(found.path, poses, self._closed), self.config.particles)
         held, place = self.grasp.targets(poses)
         information, target = np.zeros((len(nodes), 3, 3)), nodes.copy()
         information[held], target[held] = np.eye(3) / self.config.grasp.sigma**2, place
         cloud = self._cloud(views, stamp, self.radius)
         anew = fit_line(nodes, self.spacing, cloud, self.radius, self.config.fit, Anchors(target, information))
         return anew if anew.explained - _contradicted(views, anew) > score + 0.02 else fit
+
+    def _anew(self, views: Sequence[View], poses: Poses | None) -> Array | None:
+        """Nodes (N, 3) from scratch; None if nothing of this length is found."""
+        found = _find(views, self.config.start)
+        if found is None or abs(found.length - self.length) > self.config.tolerance * self.length:
+            return None
+        return resample(self._oriented(found.path, poses, self._closed), self.config.particles)
 
     def _predict(self, dt: float, stamp: int, poses: Poses | None, prior: Prior | None) -> tuple[Array, Array]:
         """Expected nodes (N, 3) [m] and their standard deviation (N,) [m]."""
