@@ -2,6 +2,7 @@
 #             (make run ARGS="--factor 2 --episodes 14"; ARGS=--help lists them)
 # make reroute  cameras to arm: a rope led through a slot, as processes; bag, report, video
 #             (make reroute ARGS="--fault tracker_killed"; ARGS=--help lists them)
+# make plant-twin  the rope's twins: recorded in the cell through cameras and tracker, identified, trained
 # make test   set-up, lint, tests            make bench  the benchmarks
 # make cables every number of the measured cables and the twins that ship (half an hour)
 # make lint   ruff and mypy                  make clean  remove what was built (out/ and data/ stay)
@@ -15,7 +16,7 @@ EXTRAS := ros,vision,plant,hardware,dev
 PYTHON ?= $(shell for p in python3.11 python3.12 python3 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' >/dev/null 2>&1 && echo $$p && break; done)
 
-.PHONY: run reroute test bench cables lint setup clean
+.PHONY: run reroute plant-twin test bench cables lint setup clean
 
 setup: $(STAMP)
 
@@ -39,11 +40,14 @@ lint: $(STAMP)
 	$(BIN)/mypy pred_core pred_ros
 
 bench: $(STAMP)
-	@set -e; for script in $(filter-out benchmarks/measured_cables.py benchmarks/hidden_%.py,$(wildcard benchmarks/*.py)); do \
+	@set -e; for script in $(filter-out benchmarks/measured_cables.py benchmarks/hidden_%.py benchmarks/reroute%.py,$(wildcard benchmarks/*.py)); do \
 		echo "== $$script"; $(BIN)/python $$script; done
 
 cables: $(STAMP)
 	@set -e; for cable in dlo1 dlo2; do $(BIN)/python benchmarks/measured_cables.py $$cable --out out/cables; done
+
+plant-twin: $(STAMP)
+	$(BIN)/python benchmarks/reroute.py twin --work out/reroute $(ARGS)
 
 clean:
 	rm -rf $(VENV) build install log *.egg-info .pytest_cache .ruff_cache .mypy_cache

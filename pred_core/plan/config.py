@@ -39,6 +39,7 @@ class SearchConfig:
     correlation: float = setting(0.7, unit="", low=0.0, high=0.99, doc="of the noise of neighbouring knots")
     finest: float = setting(0.25, unit="", low=0.01, high=1.0, doc="noise of the last sample over that of the first")
     shrink: float = setting(0.85, unit="", low=0.1, high=1.0, doc="noise of an iteration over that of the one before")
+    ways: float = setting(0.0, unit="", low=0.0, high=0.9, doc="share of samples that lead to the goal (ways.py)")
     chunk: int = setting(32, low=1, high=65536, doc="samples a rollout call; the deadline is looked at in between")
     frames: int = setting(8, low=1, high=1000, doc="moments of a rollout the costs look at, the last one included")
 

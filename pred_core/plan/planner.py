@@ -19,6 +19,7 @@ from pred_core.plan.latency import Departure, Observation, departure
 from pred_core.plan.plan import NS, Plan, check_plan
 from pred_core.plan.rollouts import Rollouts, Simulation
 from pred_core.plan.search import draw_noise, move_mean
+from pred_core.plan.ways import draw_ways
 from pred_core.types import Array
 
 Watch = Callable[[Rollouts, Array], None]  # sampled motions and their costs (K,), for markers and pictures
@@ -46,13 +47,17 @@ class Planner:
         *,
         clock: Callable[[], float] = time.monotonic,
         watch: Watch | None = None,
+        goal: Array | None = None,
     ):
-        """clock [s]: what deadlines refer to. Raises: ConfigError for an empty workspace."""
+        """clock [s]: what deadlines refer to; goal (Q, 3) [m]: where `search.ways` lead, None: there are none.
+
+        Raises: ConfigError for an empty workspace.
+        """
         self.objective = objective
         self.config = config
         self._dynamics, self._generator, self._clock, self._watch = dynamics, generator, clock, watch
         motion, search = config.motion, config.search
-        self._limits = KnotLimits(motion)
+        self._limits, self._goal = KnotLimits(motion), goal
         self._simulation = Simulation(dynamics, motion.horizon, motion.knots, search.frames)
         self._last: Plan | None = None
         self._chunk_seconds = 0.0  # the slowest of the last plan
@@ -114,6 +119,7 @@ class Planner:
             samples = mean[:, None] + noise
             if iteration == 0:
                 samples[:, 1] = 0.0  # stand still
+            self._lead(samples, here.position)
             knots = self._limits.apply(samples, first, here.position)
             costs = np.full(search.samples, np.inf)
             for begin in range(0, search.samples, search.chunk):
@@ -135,6 +141,13 @@ class Planner:
             mean = move_mean(knots[2:-2], costs, search.temperature)
         self._chunk_seconds = slowest
         return self._found(best, motions), still, history, motions, search.iterations
+
+    def _lead(self, samples: Array, here: Array) -> None:
+        """Replace the widest samples by ways to the goal, in place."""
+        count = int(self.config.search.ways * (samples.shape[1] - 2))
+        if self._goal is not None and count:
+            speed = self.config.motion.speed
+            samples[:, 2 : 2 + count] = draw_ways(self._goal, here, count, speed, self._limits, self._generator)
 
     def _found(self, best: _Best, motions: int) -> _Best:
         if not np.isfinite(best.cost):

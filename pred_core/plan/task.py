@@ -92,7 +92,8 @@ def make_planner(
     scene = scene_with_slot(twin.scene, config)
     objective = make_objective(twin.body, scene, goal, config)
     chosen = planning_dynamics(twin, scene, device) if dynamics is None else dynamics
-    return Planner(chosen, objective, config, np.random.default_rng(seed), clock=clock, watch=watch)
+    generator = np.random.default_rng(seed)
+    return Planner(chosen, objective, config, generator, clock=clock, watch=watch, goal=np.asarray(goal, float))
 
 
 def load_settings(path: str) -> PlannerConfig:
