@@ -13,15 +13,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from pred_core.diagnose.errors import WHOLE
-from pred_core.diagnose.guard_forces import backbone, moments, roll
+from pred_core.diagnose.guard_forces import moments, roll, with_network
 from pred_core.diagnose.guard_probes import probes_of
 from pred_core.diagnose.guard_shares import Share, shares, together
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.sample import make_sample
 from pred_core.errors import TwinError
-from pred_core.pred import PReD, with_residual
+from pred_core.pred import PReD
+from pred_core.residual import load_network
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
@@ -87,9 +89,7 @@ def network_guard(twin: Twin, episodes: Sequence[Episode], seed: int = 0) -> Gua
     """
     if twin.residual is None:
         raise TwinError("the twin has no network to question", next_step="Train one with: pred train")
-    model = with_residual(backbone(twin, twin.extensions, twin.meta.substeps), twin)
-    assert isinstance(model, PReD)
-    return guard_of(model, twin, episodes, seed)
+    return guard_of(with_network(twin, load_network(twin.residual)), twin, episodes, seed)
 
 
 def guard_of(model: PReD, twin: Twin, episodes: Sequence[Episode], seed: int = 0) -> Guard:
@@ -101,7 +101,7 @@ def guard_of(model: PReD, twin: Twin, episodes: Sequence[Episode], seed: int = 0
     sample = sample.some(np.flatnonzero(sample.order == 0))
     roller = Roller(twin, sample)
     path = roll(model, sample)
-    force = (path.added.norm(dim=-1) * path.counts).movedim(0, 1).double().numpy()
+    force = torch.where(path.counts, path.added.norm(dim=-1), 0.0).movedim(0, 1).double().numpy()
     probes = probes_of(roller, force, rng)
     m = moments(path, roller, probes)
     families, joint = shares(m, probes.rows, rng)

@@ -7,6 +7,7 @@ many in the output of a network on a stiff object, moves nothing and counts for 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,9 +22,10 @@ from pred_core.effects import find_effect
 from pred_core.errors import InputError
 from pred_core.identify.space import Candidate
 from pred_core.pred import BASE, Advance, PReD
+from pred_core.residual import ResidualNetwork
 from pred_core.springmass import SpringMass
 from pred_core.springmass.arrays import chains
-from pred_core.twin import Extension, Twin
+from pred_core.twin import Twin
 from pred_core.types import Array, Grip, State
 
 MOST_STATES = 3000  # (world, step) pairs that are compared
@@ -57,14 +59,18 @@ class Moments:
     values: int  # free particles' places that were compared
 
 
-def backbone(
-    twin: Twin, extensions: list[tuple[Extension, ...]] | tuple[Extension, ...], substeps: int | None
-) -> SpringMass:
-    """The twin's simulator with other effects; a world that diverges becomes NaN and leaves the others alone."""
+def backbone(twin: Twin, worlds: Sequence[Candidate], substeps: int | None) -> SpringMass:
+    """The twin's simulator with these worlds, or one for any; one that diverges becomes NaN, the others go on."""
     return SpringMass(
-        twin.body, twin.physics, twin.scene, period=twin.meta.period, substeps=substeps, extensions=extensions,
-        diverged_as_nan=True,
+        twin.body, [c.physics for c in worlds], twin.scene, period=twin.meta.period, substeps=substeps,
+        extensions=[c.extensions for c in worlds], diverged_as_nan=True,
     )  # fmt: skip
+
+
+def with_network(twin: Twin, network: ResidualNetwork) -> PReD:
+    """The twin's simulator corrected by a network."""
+    base = backbone(twin, [Candidate(twin.physics, twin.extensions)], twin.meta.substeps)
+    return PReD(base, network.eval(), twin.body)
 
 
 @torch.no_grad()
@@ -104,14 +110,14 @@ def moments(path: Path, roller: Roller, probes: Probes) -> Moments:
     """
     sample, twin = roller.sample, roller.twin
     everything: list[Probe | None] = [None, *probes.rows]
-    candidates = [Candidate(twin.physics, probes.extensions(p)) for p in everything]
+    candidates = [probes.candidate(p, twin.physics) for p in everything]
     substeps = max(roller.substeps(candidates), twin.meta.substeps or 1)
     number, width = len(everything), sample.windows.count
-    simulator = backbone(twin, [c.extensions for c in candidates for _ in range(width)], substeps)
+    simulator = backbone(twin, [c for c in candidates for _ in range(width)], substeps)
     groups = tuple(sorted(set(sample.groups.tolist())))
     group = torch.tensor([groups.index(int(sample.groups[e])) for e in sample.episode.tolist()])
     products = torch.zeros(len(groups), number, number, dtype=torch.float64)
-    onward = backbone(twin, probes.standing, substeps)
+    onward = backbone(twin, candidates[:1], substeps)
     ahead = min(max(1, round(LATER / twin.meta.period)), len(path.states) - 1)
     every = max(1, math.ceil(len(path.states) * width / MOST_STATES))
     shared, values = _shared_memory(twin), 0

@@ -8,13 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from pred_core.diagnose.roll import Roller
+from pred_core.diagnose.structure import FAMILY, ID, applies
 from pred_core.diagnose.trial import NOT_A_NAME, first_values, scanned, switch
 from pred_core.effects import LIBRARY
 from pred_core.effects.effect import Effect, Parameter
+from pred_core.identify.space import Candidate
 from pred_core.twin import Extension, Twin
-from pred_core.types import Array
+from pred_core.types import Array, Physics
 
 PLACES = 8  # where a localized cause is tried
+BENDING = 1e-4  # [N m^2] a little, for twins whose springs alone resist bending
 STEP_IN_GRIP = "acts where the object is held, which a network does not move"
 IN_SENSOR = "a sensor's, not a force"
 TOO_FLEXIBLE = "fits anything, so it is no name"
@@ -27,8 +30,9 @@ class Probe:
     effect: str
     family: str
     knob: str  # parameter[k]
-    extension: Extension
+    extension: Extension | None  # None: the probe is `bending`
     place: int = -1  # which of the places, of an effect that is tried in several; -1: it acts everywhere
+    bending: float = 0.0  # [N m^2] given to a twin that has none: it may lack the angles themselves
 
 
 @dataclass(frozen=True)
@@ -41,9 +45,14 @@ class Probes:
 
     def extensions(self, probe: Probe | None) -> tuple[Extension, ...]:
         """Of one world: everything as it stands but the probe."""
-        if probe is None:
-            return self.standing
-        return tuple(probe.extension if e.id == probe.effect else e for e in self.standing)
+        moved = None if probe is None else probe.extension
+        return tuple(moved if moved is not None and e.id == moved.id else e for e in self.standing)
+
+    def candidate(self, probe: Probe | None, physics: Physics) -> Candidate:
+        """One world."""
+        if probe is not None and probe.bending:
+            physics = dataclasses.replace(physics, bending_stiffness=probe.bending)
+        return Candidate(physics, self.extensions(probe))
 
 
 def probes_of(roller: Roller, force: Array, rng: np.random.Generator) -> Probes:
@@ -64,6 +73,8 @@ def probes_of(roller: Roller, force: Array, rng: np.random.Generator) -> Probes:
         else:
             rows += _moved(effect, _off(effect), (switch(effect),))
     ids = dict.fromkeys(p.effect for p in rows)
+    if applies(twin):
+        rows.append(Probe(ID, FAMILY, "bending_stiffness", None, bending=BENDING))
     added = tuple(LIBRARY[i].extension() for i in ids if i not in present)
     return Probes(tuple(rows), (*twin.extensions, *added), untested)
 

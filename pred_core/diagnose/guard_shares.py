@@ -58,6 +58,8 @@ def shares(m: Moments, probes: Sequence[Probe], rng: np.random.Generator) -> tup
     excited = _excited(m)
     models = {f: _model(probes, excited, family=f) for f in dict.fromkeys(p.family for p in probes)}
     models = {f: model for f, model in models.items() if model.fixed or model.places}
+    if not models:
+        raise DatasetError("no candidate cause moves the object in these episodes", next_step="Give others")
     effects = {i: _model(probes, excited, effect=i) for i in dict.fromkeys(p.effect for p in probes)}
     flips = _flips(len(m.groups), rng)
     squares = m.products[:, -1, -1]

@@ -1,0 +1,190 @@
+"""The network must not hide causes: a residual that does what a cause would do reopens the case, any other does not."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from report_cases import PERIOD, drag, recorded, rope
+from torch import Tensor
+
+from pred_core.bag.dataset import EpisodeEntry, write_dataset
+from pred_core.bag.episode import write_episode
+from pred_core.cli.main import main
+from pred_core.diagnose.guard import Guard, guard_of, network_guard
+from pred_core.diagnose.guard_forces import Moments, with_network
+from pred_core.diagnose.guard_probes import Probe
+from pred_core.diagnose.guard_shares import Model, cross_fitted, shares
+from pred_core.diagnose.report_network import read_network
+from pred_core.effects import find_effect
+from pred_core.errors import ConfigError, DatasetError, InputError, TwinError
+from pred_core.pred import load_base
+from pred_core.residual import Motion, ResidualConfig, ResidualNetwork, build_network
+from pred_core.residual.network import Buffer
+from pred_core.train import Trainer, TrainingConfig, align
+from pred_core.twin import Twin
+from pred_core.types import Episode
+
+SMALL = ResidualConfig(
+    feature=16, encoder_layers=1, hidden=16, embedding=16, temporal_layers=1, cap=0.3, feedforward=16
+)
+PLANTED = 1.5  # [1/s]
+
+
+class Planted(ResidualNetwork):
+    """In place of a network: what linear drag takes from a speed in one period, and noise beside it."""
+
+    def __init__(self, coefficient: float, noise: float = 0.0):
+        super().__init__(SMALL)
+        self.coefficient, self.noise = coefficient, noise
+        self.generator = torch.Generator().manual_seed(0)
+
+    def forward(
+        self, motion: Motion, buffer: Buffer, period: float, arc: Tensor, shuffle: Sequence[int] | None = None
+    ) -> tuple[Tensor, Buffer]:
+        noise = self.noise * torch.randn(motion.velocity.shape, generator=self.generator)
+        return -self.coefficient * period * motion.velocity + noise, buffer
+
+
+def damped_rope() -> Twin:
+    """The springs' vibrations die within a period of 33 ms, so that a velocity of a frame is one of the motion."""
+    twin = rope()
+    return twin.replace(physics=dataclasses.replace(twin.physics, damping=0.5))
+
+
+@pytest.fixture(scope="module")
+def twin() -> Twin:
+    return damped_rope()
+
+
+@pytest.fixture(scope="module")
+def episodes(twin: Twin) -> list[Episode]:
+    """Six recordings of the rope with drag: what the twin lacks."""
+    return recorded(twin, drag(coefficient=PLANTED), ("train",) * 6, frames=45)
+
+
+def asked(twin: Twin, network: ResidualNetwork, episodes: Sequence[Episode]) -> Guard:
+    return guard_of(with_network(twin, network), twin, episodes)
+
+
+def test_exactly_a_drag_is_named_and_nothing_else(twin: Twin, episodes: list[Episode]) -> None:
+    """The residual -b v dt, b = 1.5 /s, does what drag does, but at once at the end of a period: 0.9 or more of it."""
+    guard = asked(twin, Planted(PLANTED), episodes)
+    best = guard.families[0]
+    assert guard.reopened == ("drag",), guard.sentence
+    assert best.share > 0.9 and best.low > 0.85 and best.p < 0.05
+    assert max(best.effects, key=lambda i: best.effects[i]) == "drag_linear"
+    assert "drag" in guard.sentence and "exploratory" not in guard.sentence
+    said = json.loads(json.dumps(guard.to_json()))
+    assert said["reopened"] == ["drag"] and said["recordings"] == 6
+    assert "delay" in said["untested"], "a sensor's error is no force"
+
+
+def test_noise_that_is_no_law_reopens_nothing(twin: Twin, episodes: list[Episode]) -> None:
+    """White noise of 0.02 m/s: every share is a chance one, far below a tenth."""
+    guard = asked(twin, Planted(0.0, noise=0.02), episodes)
+    assert guard.reopened == () and guard.families[0].share < 0.03, guard.sentence
+    assert guard.speed == pytest.approx(0.02 * 3**0.5, rel=0.03)
+
+
+def test_half_drag_half_noise_is_half_explained(twin: Twin, episodes: list[Episode]) -> None:
+    """The share is one of variance: noise as large as the drag halves it."""
+    size = asked(twin, Planted(PLANTED), episodes).speed / 3**0.5
+    guard = asked(twin, Planted(PLANTED, noise=size), episodes)
+    assert guard.reopened[0] == "drag" and 0.35 < guard.families[0].share < 0.65, guard.sentence
+
+
+def test_a_network_trained_on_a_rope_that_lacks_drag_hides_the_drag(twin: Twin, episodes: list[Episode]) -> None:
+    """And it does not where the twin has the drag: what a network learns there is not drag."""
+    training = TrainingConfig(
+        steps=120, rollout=6, batch=8, holdout=0.0, seed=1, azimuth=False, penalty=0.0, learning_rate=3e-3
+    )
+    recordings = [align(e, twin.body, PERIOD) for e in episodes]
+    trainer = Trainer(load_base(twin), twin.body, recordings, training, SMALL)
+    while not trainer.done:
+        trainer.advance()
+    guard = network_guard(twin.replace(residual=trainer.chosen().weights()), episodes)
+    assert guard.reopened[:1] == ("drag",), guard.sentence
+    assert guard.families[0].share > 0.3
+
+
+def test_a_share_by_hand() -> None:
+    """Column a = (1, 0) in each of four recordings, network (2, 1): b = 2 leaves 1 of 5, a share of 0.8. With the
+    sign of the last recording turned the others say b = 2, (2 b)^2 + 1 = 17 are left there.
+    """
+    one = np.array([[1.0, 2.0], [2.0, 5.0]])
+    products = np.stack([one] * 4)
+    errors = cross_fitted(products, Model((0,)), np.array([[1.0, 1.0, 1.0, 1.0]]))
+    assert errors == pytest.approx(np.full((1, 4), 1.0), abs=1e-4)  # the ridge of 1e-3 shifts b by 2e-3
+    turned = cross_fitted(products, Model((0,)), np.array([[1.0, 1.0, 1.0, -1.0]]))
+    assert turned[0, 3] == pytest.approx(17.0, abs=0.1)
+
+
+def test_a_law_of_one_recording_only_is_no_law() -> None:
+    """Twelve recordings whose coefficients have random signs: in-sample each would be explained, held out none is."""
+    rng = np.random.default_rng(2)
+    signs = rng.permutation([1.0, -1.0] * 6)
+    products = np.array([[[1.0, s], [s, 1.2]] for s in signs])
+    probe = Probe("drag_linear", "drag", "coefficient[0]", find_effect("drag_linear").extension())
+    rows, joint = shares(Moments(products, tuple(range(12)), 100), [probe], rng)
+    assert rows[0].share < 0.1 and rows[0].p > 0.05 and joint < 0.1
+
+
+def test_of_several_places_the_one_is_taken_that_the_other_recordings_choose() -> None:
+    """Two columns, of which only the second is alike the network; both are orthogonal."""
+    products = np.stack([np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0], [0.0, 1.0, 1.0]])] * 3)
+    errors = cross_fitted(products, Model((), ((0, 1),)), np.ones((1, 3)))
+    assert errors == pytest.approx(np.zeros((1, 3)), abs=1e-5)
+
+
+def test_what_cannot_be_asked_is_said(twin: Twin, episodes: list[Episode]) -> None:
+    with pytest.raises(TwinError, match="no network"):
+        network_guard(twin, episodes)
+    with pytest.raises(InputError, match="adds nothing"):
+        network_guard(twin.replace(residual=build_network(SMALL, 0).weights()), episodes)
+    with pytest.raises(DatasetError, match="1 recording"):
+        asked(twin, Planted(PLANTED), episodes[:1])
+    few = asked(twin, Planted(PLANTED), episodes[:3])
+    assert few.reopened == ("drag",) and "exploratory, from 3 recordings" in few.sentence
+
+
+def test_commands_ask_and_tell(
+    twin: Twin, episodes: list[Episode], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`pred train` asks by itself; `pred diagnose --guard` asks again and says how to reopen the case."""
+    data, plain, out = tmp_path / "data", tmp_path / "twin", tmp_path / "net"
+    for e in episodes:
+        write_episode(data / f"{e.name}.mcap", e)
+    entries = [EpisodeEntry(f"{e.name}.mcap", "train", e.recording) for e in episodes]
+    write_dataset(data, object=episodes[0].object, rate=1.0 / PERIOD, entries=entries, held={0: 0})
+    twin.save(plain)
+    command = ["train", str(data), "--twin", str(plain), "--out", str(out), "--steps", "60", "--rollout", "6"]
+    sizes = ["--feature", "16", "--hidden", "16", "--embedding", "16", "--encoder-layers", "1", "--batch", "8"]
+    more = ["--temporal-layers", "1", "--learning-rate", "3e-3", "--no-azimuth", "--penalty", "0", "--cap", "0.3"]
+    assert main([*command, *sizes, *more, "--holdout", "0"]) == 0
+    said = json.loads((out / "guard.json").read_text())
+    assert f"network guard: {said['sentence']}" in capsys.readouterr().err
+    assert main(["diagnose", str(data), "--twin", str(out), "--guard", "--out", str(tmp_path / "asked")]) == 0
+    again = json.loads((tmp_path / "asked" / "guard.json").read_text())
+    printed = capsys.readouterr().out
+    assert again["families"] == said["families"] and again["sentence"] in printed
+    assert again["reopened"][0] == "drag" and f"pred diagnose {data} --twin {out}" in printed
+    assert main(["diagnose", str(data), "--twin", str(plain), "--guard", "--out", str(tmp_path / "none")]) == 2
+    assert "no network" in capsys.readouterr().err
+
+
+def test_errors_with_and_without_a_network_are_read_strictly(tmp_path: Path) -> None:
+    path = tmp_path / "network.json"
+    cell = {"mean": 2.0, "low": 1.0, "high": 3.0}
+    table = {"test": dict.fromkeys(("base", "base + network", "extended", "extended + network"), cell)}
+    path.write_text(json.dumps(table))
+    assert read_network(path) == table
+    del table["test"]["extended"]
+    path.write_text(json.dumps(table))
+    with pytest.raises(ConfigError, match="extended"):
+        read_network(path)
