@@ -243,7 +243,7 @@ def test_a_configuration_that_cannot_be_ends_the_process_with_one_line() -> None
         ({"speed": 100.0}, 2, "speed"),
     ):
         done = subprocess.run(
-            node_command("arm", parameters), env=environment, capture_output=True, text=True, timeout=30
+            node_command("arm", parameters), env=environment, capture_output=True, text=True, timeout=120
         )
         assert done.returncode == code and word in done.stderr.strip().splitlines()[-1], done.stderr
 

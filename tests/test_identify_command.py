@@ -80,7 +80,7 @@ def test_an_interrupted_command_goes_on(data: Dataset, whole: str, tmp_path: Pat
             process.send_signal(signal.SIGINT)
             break
         time.sleep(0.002)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=120)
     assert process.returncode == 130 and "run the same command again" in errors, errors
     assert (tmp_path / JOURNAL).is_file() and not (tmp_path / "twin.yaml").exists()
     assert main(["identify", str(data.root), "--out", str(tmp_path), *FLAGS]) == 0

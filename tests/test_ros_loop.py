@@ -59,7 +59,7 @@ def run(command: list[str]) -> tuple[int, str]:
         said, _ = process.communicate(timeout=HARD)
     except subprocess.TimeoutExpired:
         process.send_signal(signal.SIGTERM)
-        said, _ = process.communicate(timeout=30.0)
+        said, _ = process.communicate(timeout=120.0)
         raise AssertionError(f"not over after {HARD:g} s: {said}") from None
     return process.returncode, said
 

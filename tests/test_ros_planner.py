@@ -334,7 +334,7 @@ def test_a_process_with_bad_parameters_ends_with_one_line(
 ) -> None:
     done = subprocess.run(
         node_command("planner", parameters), env=node_environment(free_domain()), capture_output=True, text=True,
-        timeout=30, check=False,
+        timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 2
     lines = [line for line in done.stderr.strip().splitlines() if line.startswith("planner:")]

@@ -74,7 +74,7 @@ def bag_of(path: Path, frames: int, bad: int | None = None) -> Path:
 
 def test_every_message_arrives_with_its_capture_stamp_and_its_place(tmp_path: Path) -> None:
     with playing(bag=bag_of(tmp_path / "line.mcap", 80)) as (bench, heard):
-        bench.until(lambda: bench.node.exit_code is not None, "the end of the data", limit=15.0)
+        bench.until(lambda: bench.node.exit_code is not None, "the end of the data", limit=60.0)
         assert bench.node.exit_code == 0
         bench.until(lambda: len(heard.clouds) == len(heard.poses) == len(heard.closed) == 80, "every message")
     assert [stamp_of(c) for c in heard.clouds] == [points(k).stamp for k in range(80)]
@@ -87,7 +87,7 @@ def test_every_message_arrives_with_its_capture_stamp_and_its_place(tmp_path: Pa
 
 def test_episodes_follow_each_other_without_running_backwards() -> None:
     with playing(bag=SAMPLE, split="test", pause=0.5) as (bench, heard):
-        bench.until(lambda: bench.node.exit_code is not None, "the end of the data", limit=15.0)
+        bench.until(lambda: bench.node.exit_code is not None, "the end of the data", limit=60.0)
         bench.until(lambda: len(heard.clouds) == 600, "every frame")
     stamps = np.array([stamp_of(c) for c in heard.clouds])
     steps = np.diff(stamps)
@@ -101,7 +101,7 @@ def test_episodes_follow_each_other_without_running_backwards() -> None:
 
 def test_capture_stamps_are_untouched_if_asked() -> None:
     with playing(bag=SAMPLE, episodes="ep005", stamps="capture") as (bench, heard):
-        bench.until(lambda: bench.node.exit_code is not None, "the end of the data", limit=15.0)
+        bench.until(lambda: bench.node.exit_code is not None, "the end of the data", limit=60.0)
         bench.until(lambda: len(heard.clouds) == 300, "every frame")
     (captured,) = [e.stamps for e in load_dataset(SAMPLE).episodes("test") if e.name == "ep005"]
     assert [stamp_of(c) for c in heard.clouds] == captured.tolist()

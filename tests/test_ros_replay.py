@@ -114,7 +114,7 @@ def test_every_node_ends_within_two_seconds(number: signal.Signals, twin: Path, 
             process = children.running[name]
             begin = time.monotonic()
             process.send_signal(number)
-            assert process.wait(timeout=10.0) == 0, children.log(name)
+            assert process.wait(timeout=60.0) == 0, children.log(name)
             assert time.monotonic() - begin < 2.0, name
             assert is_gone(process.pid), name
         assert (tmp_path / "metrics.json").is_file(), "what was scored so far is written"

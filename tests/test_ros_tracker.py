@@ -89,12 +89,12 @@ class Rig:
         for k in range(40):
             count = len(self.frames)
             self.all(START + k * STEP)
-            self.bench.until(functools.partial(self._answered, count, k), "an answer", 30.0)
+            self.bench.until(functools.partial(self._answered, count, k), "an answer")
             if len(self.frames) >= 4:  # the first ones may miss an end, which later ones show
                 return
         raise AssertionError(f"never found; node says {self.bench.node.diagnostics.message}")
 
-    def show_until(self, condition: Callable[[], bool], names: Sequence[str], limit: float = 15.0) -> None:
+    def show_until(self, condition: Callable[[], bool], names: Sequence[str], limit: float = 60.0) -> None:
         """Go on with pictures of some cameras; diagnostics come once a second and want fresh ones."""
         end = time.monotonic() + limit
         while not condition():

@@ -67,7 +67,7 @@ def signal_after_first_step(process: subprocess.Popen[str], number: signal.Signa
             process.send_signal(number)
             break
     printed += process.stderr.read()
-    process.wait(timeout=30)
+    process.wait(timeout=120)
     return printed
 
 
