@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from bag_examples import line_episode
 from report_cases import PERIOD, answer, drag, judged, recorded, rope, with_errors
 
 from pred_core.diagnose import evidence
@@ -24,7 +25,7 @@ from pred_core.diagnose.naming import exploratory, one_recording, why_not
 from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.rounds import finish
-from pred_core.diagnose.run import diagnose
+from pred_core.diagnose.run import diagnose, moved_markers
 from pred_core.diagnose.said import sentence
 from pred_core.diagnose.sample import Sample, make_sample
 from pred_core.diagnose.skill import skill_of
@@ -69,6 +70,15 @@ def drag_trial(bench: Bench) -> Trial:
 
 
 # Fits -----------------------------------------------------------------------------------------------------------------
+
+
+def test_episodes_with_a_moved_marker_are_left_out_unless_they_are_many() -> None:
+    episodes = [dataclasses.replace(line_episode(60, 8), name=f"ep{n}") for n in range(10)]
+    episodes[3].position[:, 3, 0] += 0.01  # a tenth of its edge: the marker has slipped
+    episodes[7].position[10:15, 4:, 0] += 0.03  # an edge of 0.1 m is 0.13 m for a while
+    assert moved_markers(episodes) == ["ep3", "ep7"]
+    episodes[5].position[:, 3, 0] += 0.01
+    assert moved_markers(episodes) == [], "the object itself, or all of the data"
 
 
 def test_planted_drag_is_recovered(twin: Twin, dragged: list[Episode], reference: list[Episode]) -> None:

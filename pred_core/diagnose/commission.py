@@ -19,6 +19,7 @@ from pred_core.diagnose.sample import Sample, make_sample
 from pred_core.diagnose.trial import make_trial
 from pred_core.diagnose.weigh import Weights, misfit_of, seen_of, weigh
 from pred_core.effects import find_effect
+from pred_core.effects.effect import Effect
 from pred_core.errors import ConfigError, DatasetError
 from pred_core.identify.space import Candidate
 from pred_core.twin import Extension, Twin
@@ -141,10 +142,12 @@ def _polish(twin: Twin, sample: Sample, use: NDArray[np.bool_], config: Diagnose
     return twin
 
 
-def refined(twin: Twin, target: Target, tell: Tell | None, steps: int = 8) -> Twin:
-    """The base refined on a target whose weights stay."""
+def refined(
+    twin: Twin, target: Target, tell: Tell | None, steps: int = 8, beside: tuple[type[Effect], ...] = ()
+) -> Twin:
+    """The base, and effects `beside` it, refined on a target whose weights stay."""
     own = Target(Roller(twin, target.roller.sample), target.weights, target.stride)
-    trial = make_trial(twin, (), base_fields(twin))
+    trial = make_trial(twin, beside, base_fields(twin))
     result = fit(own, trial.space, trial.space.start(), steps)
     if tell is not None:
         tell(f"base: loss {result.loss.mean():.3f}")

@@ -27,8 +27,8 @@ def check_tracks(suspect: Sequence[Episode], reference: Sequence[Episode], twin:
                     got=_ids(more),
                     next_step="Identify a twin from this data set or its reference",
                 )
-            shown = np.isfinite(np.asarray(e.position)).all(axis=-1).any(axis=0)
-            never = [int(i) for i, seen in zip(e.tracks.id, shown, strict=True) if not seen and int(i) in have]
+            dark = ~np.isfinite(e.position).all(axis=-1)  # (T, P)
+            never = [int(i) for i in e.tracks.id[np.all(dark, axis=0)] if int(i) in have]
             if never:
                 raise DatasetError(
                     f"{where}: particles of the twin are never measured in this episode",

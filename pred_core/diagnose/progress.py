@@ -57,6 +57,13 @@ class Progress:
         self.bench = bench
         self.twins.append(bench.twin)
 
+    def withdraw(self, bench: Bench) -> None:
+        """Take back the last name and its round: the bench is as it was before."""
+        self.named.pop()
+        self.twins.pop()
+        self.rounds.pop()
+        self.bench = bench
+
     def late(self) -> bool:
         """Whether the time is used up."""
         return time.monotonic() > self.deadline

@@ -60,7 +60,7 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
     bench, config = progress.bench, progress.bench.config
     base = bench.standing()
     floor = float(_reference_losses(bench).mean()) if bench.reference is not None else 0.0
-    if number and not _something_left(progress, base, floor):
+    if progress.rounds and not _something_left(progress, base, floor):
         return False
     named = [i for n in progress.named for i in n.judged.trial.ids]
     options = candidates(bench, named)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
+from pred_core.bag.gate import GateLimits, examine_all
 from pred_core.calibration import Calibration
 from pred_core.diagnose.answer import Study, answer
 from pred_core.diagnose.commission import commission
@@ -51,12 +52,16 @@ def diagnose(
     session = min(int(e.stamps[0]) for e in corrected)
     journal = journal or Journal(None, {})
     fitted = [e for e in corrected if e.split != "ood"]
+    left_out = [] if known else moved_markers(fitted)
+    fitted = [e for e in fitted if e.name not in left_out]
     bench = commission(plain, fitted, known, config, tell, journal, session)
     check_reference(bench)
     progress = Progress(bench, journal, [bench.twin], deadline=begin + LATEST * config.seconds)
-    if bench.reference is None and applies(bench.twin):
-        _change_structure(progress, tell)
-    for number in range(config.causes):
+    if left_out:
+        why = "left out of fitting and judging, because a marker has moved on the object (`pred info`)"
+        progress.notes.append(f"{why}: {', '.join(left_out)}")
+    used = _change_structure(progress, tell) if bench.reference is None and applies(bench.twin) else 0
+    for number in range(used, config.causes):
         if number and progress.late():
             progress.notes.append(f"stopped after {number} rounds: --seconds {config.seconds:g} were used up")
             break
@@ -69,6 +74,16 @@ def diagnose(
     return answer(study, progress, begin, tell)
 
 
+def moved_markers(episodes: Sequence[Episode]) -> list[str]:
+    """Episodes in which neighbouring particles do not keep their distance: no cause explains them, and they would
+    decide everything. None, if that holds for most of them: then it is the object that stretches, or all of the data.
+    """
+    limits = GateLimits()
+    found = [q.name for q in examine_all(lambda: episodes) if q.stretch_frames > 0 or q.slip_max > limits.slip]
+    return found if len(found) <= MOST_LEFT_OUT * len(episodes) else []
+
+
+MOST_LEFT_OUT = 0.2  # of the episodes
 LATEST = 0.8  # share of the time after which no further round begins; the errors and the report take the rest
 
 
@@ -97,14 +112,18 @@ def _check(
         raise DatasetError("two bags have one name", got=", ".join(twice[:3]), next_step="Rename one of them")
 
 
-def _change_structure(progress: Progress, tell: Tell) -> None:
-    """Name bending by angle, if a chain with it is better than the springs as they are."""
-    base = progress.bench.standing()
-    found = question(progress.bench, progress.journal, tell)
+def _change_structure(progress: Progress, tell: Tell) -> int:
+    """Name bending by angle, if a chain with it is better than the springs as they are. Returns the rounds used."""
+    before = progress.bench
+    base = before.standing()
+    found = question(before, progress.journal, tell)
     if found is None:
-        return
+        return 0
     bench, judged, p = found
-    closed = judged.mean / float(base.mean())
-    if closed < progress.bench.config.cold_gate:
-        return
-    progress.add(Named(judged, p, (), closed, -1), bench)
+    progress.add(Named(judged, p, (), judged.mean / float(base.mean()), -1), bench)
+    if float(bench.standing().mean()) < float(base.mean()):
+        return 0
+    if not one_round(progress, tell, 0):  # judged together with damping, which was not found
+        progress.withdraw(before)
+        tell("bending by angle: withdrawn")
+    return 1
