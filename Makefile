@@ -40,14 +40,14 @@ lint: $(STAMP)
 	$(BIN)/mypy pred_core pred_ros
 
 bench: $(STAMP)
-	@set -e; for script in $(filter-out benchmarks/measured_cables.py benchmarks/hidden_%.py benchmarks/reroute%.py,$(wildcard benchmarks/*.py)); do \
+	@set -e; for script in $(filter-out benchmarks/measured_cables.py benchmarks/hidden_%.py benchmarks/reroute%.py benchmarks/rope_tasks.py,$(wildcard benchmarks/*.py)); do \
 		echo "== $$script"; $(BIN)/python $$script; done
 
 cables: $(STAMP)
 	@set -e; for cable in dlo1 dlo2; do $(BIN)/python benchmarks/measured_cables.py $$cable --out out/cables; done
 
 plant-twin: $(STAMP)
-	$(BIN)/python benchmarks/reroute.py twin --work out/reroute $(ARGS)
+	$(BIN)/python benchmarks/reroute.py twin --work out/trials $(ARGS)
 
 clean:
 	rm -rf $(VENV) build install log *.egg-info .pytest_cache .ruff_cache .mypy_cache

@@ -1,12 +1,12 @@
 """Leading a cable through a slot in lock-step: twins, trials, scores.
 
-    python benchmarks/reroute.py twin --work out/reroute
+    python benchmarks/reroute.py twin --work out/trials
         the recipe: random motions in the cell, recorded through cameras and tracker; two twins of the same data with
         the same search: `spring-mass` (the paper's five parameters) and `pred` (bending by angle and its damping, and
         the residual where it helps on held-out recordings). No access to the truth. Goes on where it stopped
-    python benchmarks/reroute.py run --work out/reroute --trials 30 [--eyes cameras] [--gap 0.016] [--jobs 2]
+    python benchmarks/reroute.py run --work out/trials --trials 30 [--eyes cameras] [--gap 0.016] [--jobs 2]
         trials of both twins, seed by seed, with the same starts, goals and budgets; what is there is kept
-    python benchmarks/reroute.py score --work out/reroute
+    python benchmarks/reroute.py score --work out/trials
         the table, scores.json and report.html
 
 A trial ends when the rope is through at two looks in a row (pred_core/plant/live/success.py), or when its time is up.

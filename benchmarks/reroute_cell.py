@@ -10,7 +10,7 @@ from pred_core.arm.limits import GuardConfig
 from pred_core.errors import InputError
 from pred_core.plan.plan import Plan
 from pred_core.plant.live.cell import Cell
-from pred_core.plant.live.mover import ToolPose
+from pred_core.plant.live.mover import Segment, ToolPose
 from pred_core.plant.live.station import TICK, Moment, Station
 from pred_core.plant.live.teleop import draw_route
 from pred_core.types import Array
@@ -33,9 +33,11 @@ class DrivenCell:
         self.station = Station(cell, pictures)
         self.guard, self._follower = Guard(GUARD), Follower(GUARD, LIFETIME)
 
-    def begin(self, seed: int) -> Moment:
-        """A start pose, the guard armed where the arm stands."""
+    def begin(self, seed: int, way: Segment | None = None) -> Moment:
+        """A start pose, then a scripted way if there is one; the guard is armed where the arm stands then."""
         moment = self.station.reset(seed)
+        if way is not None:
+            moment = go(self.station, way)
         pose = moment.truth.gripper
         self.guard.arm(pose.position, pose.rotation.tolist())
         return moment
@@ -78,6 +80,15 @@ class DrivenCell:
                     self.guard.command(target[0], target[1], now, now)
         setpoint = self.guard.tick(now)
         return None if setpoint is None else ToolPose(setpoint.position, np.array(setpoint.rotation))
+
+
+def go(station: Station, way: Segment) -> Moment:
+    """Lead the tool along a way with a smooth speed, and let the rope rest for REST."""
+    count = round(way.seconds / TICK)
+    for k in range(1, count + round(REST / TICK) + 1):
+        s = min(1.0, k / count)
+        station.advance(way.at(s**3 * (10.0 - 15.0 * s + 6.0 * s * s)), 1)
+    return station.moment
 
 
 def show_goal(cell: Cell, seed: int) -> Array:

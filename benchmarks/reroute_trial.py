@@ -24,6 +24,7 @@ from pred_core.plan.task import make_planner, planning_dynamics, scene_with_slot
 from pred_core.plant.cameras import ring_of_cameras
 from pred_core.plant.live.cell import WORKPLACE, Cell, CellConfig
 from pred_core.plant.live.slot import SlotConfig
+from pred_core.plant.live.station import Moment
 from pred_core.twin import Twin
 from pred_core.types import Array
 
@@ -64,7 +65,7 @@ def run_trial(
         eyes: Eyes = CameraEyes(twin, cell, dynamics) if cameras else TrueEyes(twin)
         planner = make_planner(twin, goal, slotted, seed, dynamics=dynamics)
         trial = Trial(driven, eyes, planner, config, goal)
-        outcome = trial.run(seed)
+        outcome = trial.run(driven.begin(seed))
         touches = cell.touches
         return {
             "seed": seed,
@@ -89,9 +90,14 @@ def run_trial(
 class Trial:
     """The loop of one trial, and what it writes down."""
 
-    def __init__(self, driven: DrivenCell, eyes: Eyes, planner: Planner, config: TrialConfig, goal: Array):
+    def __init__(
+        self, driven: DrivenCell, eyes: Eyes, planner: Planner, config: TrialConfig, goal: Array, slot: bool = True
+    ):
+        """slot False: the task is another one, and only time ends the trial."""
+        self._slot = slot
         self._driven, self._eyes, self._planner, self._config, self._goal = driven, eyes, planner, config, goal
         self._force: Plan | None = None
+        self._began = 0.0  # [s] of the cell
         self.chamfer: list[tuple[float, float]] = []  # [s], [m] of the true rope to the goal
         self.replans: list[dict[str, float]] = []
         self.refused: list[str] = []  # plans that planner or arm refused, and why
@@ -99,20 +105,21 @@ class Trial:
         self.errors: list[float] = []  # [mm] mean of the observed state against the truth
         self.way: list[list[float]] = []  # gripper at every replan [m]
 
-    def run(self, seed: int) -> str:
-        """Until the rope is through at two looks in a row, the arm has stopped, or time is up."""
+    def run(self, begin: Moment) -> str:
+        """From `begin` until the rope is through at two looks in a row, the arm has stopped, or time is up."""
         cell = self._driven.station.cell
-        self._eyes.see([self._driven.begin(seed)])
+        self._eyes.see([begin])
+        self._began = cell.time
         through = False
         while True:
             self._note()
-            success = cell.judge().success
+            success = self._slot and cell.judge().success
             if success and through:
                 return "through"
             through = success
             if self._driven.fault is not None:
                 return f"arm stopped: {self._driven.fault}"
-            if cell.time >= self._config.limit - 1e-6:
+            if self._time() >= self._config.limit - 1e-6:
                 return "time is up"
             if not success:
                 self._replan()
@@ -155,7 +162,7 @@ class Trial:
         self.way.append(np.round(truth.gripper.position, 4).tolist())
 
     def _time(self) -> float:
-        return round(self._driven.station.cell.time, 3)
+        return round(self._driven.station.cell.time - self._began, 3)
 
 
 def goal_of(cell: Cell, config: TrialConfig, seed: int, goals: Path | None) -> Array:

@@ -8,7 +8,7 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from pred_core.types import ObjectInfo, Physics, Scene
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 MODULES = ("hidden_scores", "measured_cables", "reroute_cell", "reroute_eyes", "reroute_trial", "reroute_scores",
-           "reroute")  # fmt: skip
+           "reroute", "rope_tasks")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +175,21 @@ def test_ways_lead_to_the_goal_over_a_height_and_keep_the_limits() -> None:
     # Two of three go over posts of 0.1 m with a hand; ends scatter by 3 cm an axis: sqrt(3) 3 cm = 5 cm.
     assert np.mean(np.array(heights) > 0.13) > 0.5
     assert np.median(ends) < 0.07
+
+
+def test_scripted_hands_of_the_four_tasks(bench) -> None:
+    tasks = bench["rope_tasks"]
+    rope = load_settings(str(tasks.SETTINGS))
+    hand, end = np.array([0.45, -0.15, 0.07]), np.array([0.45, -0.35, 0.004])
+    truth = SimpleNamespace(gripper=SimpleNamespace(position=hand), rope=np.stack([hand, end]))
+    assert tasks.hand_of("lift", truth, rope) == pytest.approx([0.45, -0.15, 0.25])
+    assert tasks.hand_of("lower", truth, rope) == pytest.approx([0.45, -0.15, 0.03])
+    turned = tasks.hand_of("rotate", truth, rope)
+    assert np.linalg.norm(turned[:2] - end[:2]) == pytest.approx(0.2) and turned[2] == pytest.approx(0.07)
+    assert abs(turned[0] - 0.45) == pytest.approx(0.2 * np.sin(0.6))
+    # 45 % of 0.2 m towards the end, 8 cm aside.
+    bent = tasks.hand_of("bend", truth, rope)
+    assert (abs(bent[0] - 0.45), bent[1]) == pytest.approx((0.08, -0.24))
 
 
 def test_unusable_twins_and_settings_are_refused(bench, twin: Twin, settings: PlannerConfig) -> None:
