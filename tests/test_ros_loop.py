@@ -8,7 +8,10 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,10 +22,12 @@ pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 from mcap.reader import make_reader
 from sensor_msgs.msg import Image
 
+from pred_core.errors import PredError
 from pred_core.plant.live.slot import SlotConfig
 from pred_core.plant.live.success import Passage, judge_passage
-from pred_ros import convert, reroute
+from pred_ros import convert, reroute, reroute_loop
 from pred_ros.camera_pairs import CameraPairs
+from pred_ros.processes import Children
 from pred_ros.reroute_faults import FAULTS
 from pred_ros.reroute_record import PlanSeen, Record, Said
 from pred_ros.reroute_report import timeline
@@ -116,6 +121,28 @@ def test_bad_input_is_one_line(arguments: list[str], words: str, capsys: pytest.
     assert reroute.main([*arguments, "--out", str(tmp_path)]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and words in lines[0]
+
+
+def test_a_killed_node_is_gone_and_comes_back_under_watch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = "import sys, time; time.sleep(float(sys.argv[1])); sys.exit('tired')"
+    monkeypatch.setattr(
+        reroute_loop, "node_command", lambda node, given: [sys.executable, "-S", "-c", code, str(given["for"])]
+    )
+    nodes = {"tracker": {"for": 300.0}, "arm": {"for": 300.0}}
+    watch: Any = SimpleNamespace(record=record_of([(0.0, 0.0)]), spin=time.sleep)
+    with Children(dict(os.environ), tmp_path) as children:
+        loop = reroute_loop.Loop(reroute_loop.Job(nodes, np.zeros((1, 3)), tmp_path), children, watch)
+        for node, parameters in nodes.items():
+            children.start(node, reroute_loop.node_command(node, parameters))
+        loop.kill("tracker")
+        loop.check()  # nobody minds that it is gone
+        assert set(children.running) == {"arm"}
+        nodes["tracker"]["for"] = 0.0
+        loop.restart("tracker")
+        with pytest.raises(PredError, match="the tracker_2 ended with code 1; got tired"):
+            loop.wait(lambda: False, 60.0, "the end")
+        loop.kill("tracker")  # also under its new name
+        loop.check()
 
 
 def record_of(path: list[tuple[float, float]]) -> Record:
