@@ -38,8 +38,6 @@ S = 1_000_000_000  # [ns]
 SETTINGS = """
 motion: {horizon: 1.0, knots: 4}
 search: {samples: 16, chunk: 16, iterations: 1, frames: 4}
-costs: {passage: 1.0}
-slot: {}
 """
 HARD = 400.0  # [s] after which a run is killed
 
@@ -48,8 +46,10 @@ def light(folder: Path, *more: str) -> list[str]:
     """Command line of a light run on the same path: a gripper without an arm, small pictures, few motions."""
     settings = folder / "settings.yaml"
     settings.write_text(SETTINGS, encoding="utf-8")
+    goal = folder / "goal.npy"  # on the near side of the slot: so few motions would not find through it
+    np.save(goal, reroute.through_slot(SlotConfig(), 0.5) - [0.0, 0.3, 0.0])
     return [
-        sys.executable, "-m", "pred_ros.reroute", "--out", str(folder / "out"),
+        sys.executable, "-m", "pred_ros.reroute", "--out", str(folder / "out"), "--goal", str(goal),
         "plant.mover=free", "plant.factor=0.25", "plant.cameras=3", "plant.camera_rate=6.0", "plant.width=320",
         "plant.height=240", "tracker.cameras=cam0 cam1 cam2", f"planner.settings={settings}", *more,
     ]  # fmt: skip
