@@ -8,6 +8,7 @@ behind: a bag, a report, a video. The plant's truth goes to the judge and the re
 from __future__ import annotations
 
 import argparse
+import math
 import shlex
 import signal
 import socket
@@ -21,7 +22,7 @@ import numpy as np
 
 from pred_core.arm.limits import GuardConfig
 from pred_core.cli.main import BAD_INPUT, INTERRUPTED
-from pred_core.errors import PredError
+from pred_core.errors import ConfigError, PredError
 from pred_core.plan.endpoints import read_cloud
 from pred_core.plan.goal import size_of
 from pred_core.plant.live.slot import SlotConfig
@@ -35,6 +36,7 @@ from pred_ros.reroute_verdict import Verdict, judge
 from pred_ros.resources import config_folder
 
 NOT_REACHED = 1
+NODES = ("plant", "tracker", "predictor", "planner", "arm")
 AHEAD = 0.16  # [m] of rope beyond the slot in the goal
 LIFTED = 0.035  # [m] by which its end is held above the table there
 SPACING = 0.01  # [m] of the goal's points
@@ -64,10 +66,14 @@ def _interrupt(number: int, frame: object) -> NoReturn:
 def go(args: argparse.Namespace) -> int:
     """Prepare, run, judge, report. Raises: PredError."""
     nodes = prepare(args)
+    check_times(args)
     goal = read_cloud(args.goal) if args.goal else through_slot(SlotConfig(), size_of(Twin.load(args.twin).body))
     fault = FAULTS[args.fault] if args.fault else None
     job = Job(nodes, goal, args.out, args.limit, fault, args.fault_at, None if args.no_pictures else "cam0")
-    args.out.mkdir(parents=True, exist_ok=True)
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError("--out", got=error, allowed="a folder that can be written to") from error
     begin = time.monotonic()
     record = run(job, lambda line: print(line, file=sys.stderr, flush=True))
     verdict = judge(record, record.wall, float(nodes["arm"].get("speed", GuardConfig.speed)), fault)
@@ -93,9 +99,26 @@ def passed(verdict: Verdict, fault: Fault | None) -> bool:
     return told and (verdict.success or not fault.reachable)
 
 
+def check_times(args: argparse.Namespace) -> None:
+    """Raise ConfigError for times and seeds that cannot be, and for a fault that would not happen before the end."""
+    if not (math.isfinite(args.limit) and args.limit > 0.0):
+        raise ConfigError("--limit", got=args.limit, allowed="above 0 s")
+    if not (math.isfinite(args.fault_at) and args.fault_at >= 0.0):
+        raise ConfigError("--fault-at", got=args.fault_at, allowed="0 s or more")
+    if args.seed < 0:
+        raise ConfigError("--seed", got=args.seed, allowed="0 or more")
+    last = max((step.after for step in FAULTS[args.fault].steps), default=0.0) if args.fault else 0.0
+    if args.fault and args.fault_at + last >= args.limit:
+        begins = f"{args.fault} would be over after {args.fault_at + last:g} s"
+        raise ConfigError(begins, got=f"--limit {args.limit:g}", allowed="more", next_step="Give a longer --limit")
+
+
 def prepare(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """Parameters of every node: the file's, a free port, the twin, the planner's settings, then the overrides."""
     nodes = read_nodes(args.nodes)
+    missing = [n for n in NODES if n not in nodes]
+    if missing:
+        raise ConfigError(f"{args.nodes}: {', '.join(missing)} missing", got=", ".join(nodes), allowed=", ".join(NODES))
     port = free_port()
     for node in ("plant", "arm"):
         nodes[node]["port"] = port

@@ -69,6 +69,7 @@ class Watch:
         self._keep(DiagnosticArray, DIAGNOSTICS, QoSProfile(depth=100), self._on_diagnostics)
         if camera is not None:
             self._intrinsics: Any = None
+            self._camera_pose: Any = None
             self._keep(PoseStamped, f"{camera}/{images.POSE}", qos.latched(), self._on_camera_pose)
             self._keep(CameraInfo, f"{camera}/{images.INFO}", qos.images(), self._on_info)
             self.node.create_subscription(Image, f"{camera}/{images.COLOR}", self._on_picture, qos.images())
@@ -167,8 +168,9 @@ class Watch:
                 self.record.status[node] = said
                 self.record.said.append(said)
             values = {v.key: v.value for v in status.values}
+            known = self.record.values.get(node, {})
             self.record.values[node] = values
-            if node == "planner" and "planning [s]" in values:
+            if node == "planner" and "planning [s]" in values and values["planning [s]"] != known.get("planning [s]"):
                 row = (self.record.now, float(values["planning [s]"]), int(values["motions tried"]))
                 self.record.planning.append(row)
 
@@ -184,7 +186,7 @@ class Watch:
         stamp = stamp_of(message)
         jpeg = images.compress_color(images.read_color(message, self._camera), JPEG_QUALITY)
         self.record.pictures.append((stamp, jpeg))
-        if self.record.view is None and self._intrinsics is not None:
+        if self.record.view is None and self._intrinsics is not None and self._camera_pose is not None:
             self.record.view = View(self._camera, self._intrinsics, self._camera_pose)
         packed = images.make_compressed(stamp, self._camera, "rgb8; jpeg compressed bgr8", jpeg)
         self._writer.write(f"{self._camera}/{images.COLOR_COMPRESSED}", packed, self.record.now)

@@ -115,6 +115,10 @@ def test_a_node_that_fails_ends_the_run_with_its_own_line(tmp_path: Path) -> Non
         (["plant.gap"], "NODE.PARAMETER=VALUE"),
         (["camera.rate=3"], "plant, tracker, predictor, planner, arm"),
         (["--goal", "goal.png"], "unknown kind of cloud"),
+        (["--limit", "nan"], "--limit"),
+        (["--seed", "-1"], "--seed"),
+        (["--fault", "slip", "--limit", "2"], "Give a longer --limit"),
+        (["--nodes", "config/nodes/live.yaml"], "plant, tracker, planner, arm missing"),
     ],
 )
 def test_bad_input_is_one_line(arguments: list[str], words: str, capsys: pytest.CaptureFixture, tmp_path: Path) -> None:

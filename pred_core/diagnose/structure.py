@@ -35,15 +35,16 @@ STIFF = (1.0, 10.0, 100.0)  # axial stiffnesses tried first, over the present on
 
 def applies(twin: Twin) -> bool:
     """A line whose bending is left to springs that skip particles, or to nothing."""
-    return twin.body.kind == "line" and twin.physics.bending_stiffness == 0.0 and len(twin.body.bends) > 0
+    body = twin.body
+    if body.kind != "line" or twin.physics.bending_stiffness != 0.0 or len(body.bends) == 0:
+        return False
+    springs = {tuple(sorted(s)) for s in body.springs.tolist()}
+    return _neighbours(twin) <= springs  # one line, whose neighbours are all connected
 
 
 def chain(twin: Twin) -> Twin:
     """The twin with springs between neighbours alone."""
-    body = twin.body
-    bends = np.asarray(body.bends)
-    path = [*bends[:, 0].tolist(), *bends[-1, 1:].tolist()]
-    neighbours = {tuple(sorted(p)) for p in zip(path[:-1], path[1:], strict=True)}
+    body, neighbours = twin.body, _neighbours(twin)
     keep = np.array([tuple(sorted(s)) in neighbours for s in body.springs.tolist()])
     slim = dataclasses.replace(
         body,
@@ -55,6 +56,13 @@ def chain(twin: Twin) -> Twin:
     longest = 1.001 * float(slim.rest_length.max())
     physics = dataclasses.replace(twin.physics, max_springs=2, connection_threshold=longest, bending_stiffness=1e-3)
     return twin.replace(body=slim, physics=physics)
+
+
+def _neighbours(twin: Twin) -> set[tuple[int, ...]]:
+    """Pairs of particles that follow each other along the line."""
+    bends = np.asarray(twin.body.bends)
+    path = [*bends[:, 0].tolist(), *bends[-1, 1:].tolist()]
+    return {tuple(sorted(p)) for p in zip(path[:-1], path[1:], strict=True)}
 
 
 def question(bench: Bench, journal: Journal, tell: Tell) -> tuple[Bench, Judged, float] | None:
@@ -120,8 +128,8 @@ def _asked(bench: Bench, beside: tuple[type[Effect], ...], journal: Journal, key
     trial = _trial(twin)
     knobs = trial.space.knobs
     spread = [with_stored(slim, v).physics.bending_stiffness for _, v in stored["without"]]
-    width = 1.645 * float(np.std(spread)) * max(len(spread) - 1, 1) ** 0.5
     value = twin.physics.bending_stiffness
+    width = 1.645 * float(np.std(spread)) * (len(spread) - 1) ** 0.5 if len(spread) > 1 else value  # one: not known
     judged = Judged(
         trial=trial,
         values={k.name: value for k in knobs},
