@@ -86,14 +86,14 @@ def test_a_killed_predictor_comes_back_in_mid_replay(twin: Path, tmp_path: Path)
         parameters = {"twin": twin, "held": HELD, "overload": "queue", "wait_for": 1}
         children.start("evaluator", node_command("evaluator", {"out": tmp_path, "patience": 3.0}))
         children.start("predictor", node_command("predictor", parameters))
-        player = {"bag": SAMPLE, "split": "all", "factor": 1.5, "wait_for": 2, "patience": 60.0}
+        player = {"bag": SAMPLE, "split": "all", "factor": 0.7, "wait_for": 2, "patience": 60.0}
         children.start("player", node_command("player", player))
         wait_for(lambda: "mean error" in children.log("evaluator"), 30.0, "the first scores", children)
         os.killpg(children.running["predictor"].pid, signal.SIGKILL)
         children.running["predictor"].wait()
         children.start("predictor", node_command("predictor", parameters))
         evaluator = children.running["evaluator"]
-        wait_for(lambda: evaluator.poll() is not None, 60.0, "the end of the replay", children)
+        wait_for(lambda: evaluator.poll() is not None, 120.0, "the end of the replay", children)
         assert evaluator.returncode == 0, children.log("evaluator")
         assert "predicting" in children.log("predictor")
     written = json.loads((tmp_path / "metrics.json").read_text())
