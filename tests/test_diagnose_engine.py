@@ -14,13 +14,12 @@ import torch
 from bag_examples import line_episode
 from report_cases import PERIOD, answer, drag, judged, recorded, rope, with_errors
 
-from pred_core.diagnose import evidence
 from pred_core.diagnose.commission import commission, values_of
 from pred_core.diagnose.config import DiagnoseConfig
-from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals, set_limit, simplest
+from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.fit import Fit, fit, rho, without_groups
 from pred_core.diagnose.journal import Journal
-from pred_core.diagnose.judge import Bench, judge, quick, screen
+from pred_core.diagnose.judge import Bench, judge, screen
 from pred_core.diagnose.naming import exploratory, one_recording, why_not
 from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.roll import Roller
@@ -32,11 +31,11 @@ from pred_core.diagnose.skill import skill_of
 from pred_core.diagnose.trial import Trial, make_trial
 from pred_core.diagnose.weigh import weigh
 from pred_core.effects import find_effect
-from pred_core.errors import ConfigError, DatasetError
+from pred_core.errors import DatasetError
 from pred_core.identify.space import Candidate
 from pred_core.springmass import SpringMass
 from pred_core.twin import Extension, Twin
-from pred_core.types import Array, Episode, Grip, State
+from pred_core.types import Episode, Grip, State
 
 SPLITS = ("train",) * 5 + ("test",)
 SMALL = DiagnoseConfig(places=4, survivors=3, iterations=6)
@@ -134,109 +133,6 @@ def test_the_loss_is_quadratic_for_small_and_straight_for_large_residuals() -> N
 
 
 # Statistics -----------------------------------------------------------------------------------------------------------
-
-
-def gains(twin: Twin, rows: Array) -> list[Judged]:
-    return [judged(twin, "drag_linear", 1.0, 0.1, row.tolist()) for row in rows]
-
-
-def test_family_wise_errors_are_what_they_say(twin: Twin, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four correlated candidates on ten episodes, nothing in them, 400 times: the smallest adjusted p is below 0.05
-    in 20 of them. 99.9 % of Binomial(400, 0.05) lies in 7..36; of Binomial(400, 0.5) in 167..233.
-    """
-    monkeypatch.setattr(evidence, "FLIPS", 999)
-    rng = np.random.default_rng(1)
-    smallest = []
-    for seed in range(400):
-        shared = rng.standard_t(3, size=10)
-        smallest.append(family_wise(gains(twin, shared + rng.standard_t(3, size=(4, 10))), seed).min())
-    p = np.array(smallest)
-    assert 7 <= (p <= 0.05).sum() <= 36
-    assert 167 <= (p <= 0.5).sum() <= 233
-
-
-def test_a_shift_is_found_among_candidates_without_one(twin: Twin) -> None:
-    """Gains of 2 +- 1 on 12 episodes: t = 7. Sign flips reach that once in 4096; with 5 candidates below 0.005."""
-    rng = np.random.default_rng(0)
-    rows = rng.normal(0.0, 1.0, (5, 12))
-    rows[3] += 2.0
-    p = family_wise(gains(twin, rows), 0)
-    assert p[3] < 0.005 and (np.delete(p, 3) > 0.05).all()
-
-
-def test_episodes_that_fit_worse_are_told() -> None:
-    """Losses have a scale of their own, so their logs are compared. On 8 against 8 episodes a factor of 3 over a
-    scatter of 30 % is 5 standard errors; nothing is told of 2 episodes.
-    """
-    rng = np.random.default_rng(0)
-    one, other = 3.0 * np.exp(rng.normal(0, 0.3, 8)), np.exp(rng.normal(0, 0.3, 8))
-    ground = np.zeros(8, dtype=bool)
-    assert lack_of_fit(one, other, 0, ground, ground) < 0.001
-    assert lack_of_fit(other, one, 0, ground, ground) > 0.9  # one-sided
-    assert lack_of_fit(1e3 * one, 1e3 * other, 0, ground, ground) == lack_of_fit(one, other, 0, ground, ground)
-    assert lack_of_fit(one[:2], other, 0, ground[:2], ground) == 1.0
-
-
-def test_a_lack_of_fit_on_the_ground_alone_is_told() -> None:
-    """Half of the episodes lie; only these fit worse. Pooled, a factor of 2 in half of them would drown in 30 times
-    larger losses on the ground; apart it is 5 standard errors, doubled for two tests.
-    """
-    rng = np.random.default_rng(2)
-    ground = np.arange(16) % 2 == 0
-    scale = np.where(ground, 30.0, 1.0)
-    one = scale * np.where(ground, 3.0, 1.0) * np.exp(rng.normal(0, 0.3, 16))
-    other = scale * np.exp(rng.normal(0, 0.3, 16))
-    assert lack_of_fit(one, other, 0, ground, ground) < 0.005
-
-
-def test_lack_of_fit_errs_as_often_as_it_says() -> None:
-    """120 draws of 6 against 6 in the air and 6 against 6 on the ground: two tests at 2.5 % err in 1 - 0.975^2 = 4.9 %
-    of them, 6. 99.9 % of Binomial(120, 0.049) lies below 15; none at all has a probability of 0.2 %.
-    """
-    rng = np.random.default_rng(3)
-    ground = np.arange(12) % 2 == 0
-    losses = np.exp(rng.normal(0, 1, (120, 2, 12)))
-    p = np.array([lack_of_fit(one, other, n, ground, ground) for n, (one, other) in enumerate(losses)])
-    assert 1 <= (p <= 0.05).sum() <= 14
-
-
-def nested(twin: Twin, share: float) -> tuple[Judged, Judged]:
-    """Drag with one number, saving `share` of what attraction with more numbers saves, on 10 episodes."""
-    rich = np.linspace(1.0, 2.0, 10)
-    many = make_trial(twin, (find_effect("attraction"),))
-    plain = judged(twin, "drag_linear", 1.0, 0.1, (share * rich).tolist())
-    names = [k.name for k in many.space.knobs]
-    flexible = dataclasses.replace(
-        plain,
-        trial=many,
-        gain=rich,
-        values=dict.fromkeys(names, 1.0),
-        null=dict.fromkeys(names, 0.0),
-        intervals=dict.fromkeys(names, (0.9, 1.1)),
-        z=np.zeros(len(names)),
-    )
-    return plain, flexible
-
-
-def test_the_simpler_law_is_preferred_when_it_explains_as_much(twin: Twin) -> None:
-    plain, flexible = nested(twin, 0.98)
-    assert plain.parameters == 1 < flexible.parameters
-    assert simplest([flexible, plain], flexible) is plain
-    plain, flexible = nested(twin, 0.8)  # always 20 % less: many standard errors, and beyond a tenth
-    assert simplest([flexible, plain], flexible) is flexible
-    assert simplest([flexible, plain], plain) is plain  # more numbers are never preferred
-
-
-def test_rivals_are_counted_in_standard_errors(twin: Twin) -> None:
-    """Differences 1, 2, 3, 4 have mean 2.5 and standard error 1.291 / 2: 3.873; limit t(3) at 90 %: 1.638."""
-    best, other = gains(twin, np.array([[5.0, 5.0, 5.0, 5.0], [4.0, 3.0, 2.0, 1.0]]))
-    rows = rivals([other, best], best)
-    assert rows[0][0] is best and rows[0][1] == 0.0
-    assert rows[1][1] == pytest.approx(2.5 / (1.2909944 / 2.0))
-    assert set_limit(4) == pytest.approx(1.6377, abs=1e-4)
-
-
-# Samples, restarts, weights -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("window", [0.3, 0.5, 1e6])
@@ -482,50 +378,6 @@ def test_cut_anywhere_it_goes_on_to_the_same_answer(
         assert plain(again) == plain(whole) and again.twin.digest() == whole.twin.digest()
         assert journal.replayed == kept - 1
         assert cut.read_text() == path.read_text()
-
-
-def test_a_journal_belongs_to_its_data(tmp_path: Path) -> None:
-    path = tmp_path / "journal.jsonl"
-    assert Journal(path, {"data": "a"}).once("x", lambda: [1.0]) == [1.0]
-    assert Journal(path, {"data": "a"}).once("x", lambda: [2.0]) == [1.0]
-    other = Journal(path, {"data": "b"})
-    assert other.once("x", lambda: [3.0]) == [3.0]
-    assert '"a"' in (tmp_path / "journal.old.jsonl").read_text()
-    assert '"a"' not in path.read_text()
-
-
-@pytest.mark.parametrize("line", ["not a line", '{"key": "x"}', "[1, 2]", "3"])
-def test_a_damaged_journal_is_refused(tmp_path: Path, line: str) -> None:
-    path = tmp_path / "journal.jsonl"
-    Journal(path, {}).once("x", lambda: 1)
-    path.write_text(path.read_text() + line + "\n")
-    with pytest.raises(ConfigError, match=r"journal\.jsonl: is damaged.*Delete it") as refused:
-        Journal(path, {})
-    assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("base", 3), ("base", {"physics": {"stiffness": "soft"}, "extensions": []}), ("x/screen", []),
-     ("x/screen", [[[0.1, 0.2], 1.0]]), ("x/quick", [[None], 1.0]), ("x/fit", {"z": [1.0]}),
-     ("x/fit", {"z": [1.0], "null": [0.0], "left_out": [[1.0]], "gain": [1.0], "moved": [1.0], "extended": [1.0]})],
-)  # fmt: skip
-def test_a_value_that_no_diagnosis_wrote_is_refused(
-    twin: Twin, reference: list[Episode], tmp_path: Path, key: str, value: Any
-) -> None:
-    """The line is whole, what it says is not: text for a number, nothing, a coordinate too many, an episode too few."""
-    path = tmp_path / "journal.jsonl"
-    Journal(path, {}).once("base", lambda: values_of(twin))
-    lines = [line for line in path.read_text().splitlines() if f'"{key}"' not in line]
-    path.write_text("\n".join([*lines, json.dumps({"key": key, "value": value})]) + "\n")
-    journal = Journal(path, {})
-    said = f"journal.jsonl: the value of '{key}' is damaged.*Delete the file"
-    with pytest.raises(ConfigError, match=said) as refused:
-        bench = commission(twin, reference[:2], reference[2:4], SMALL, quiet, journal)
-        found = screen(bench, (find_effect("drag_linear"),), np.random.default_rng(0), journal, "x/screen")
-        quick(bench, found, journal, "x/quick")
-        judge(bench, found, journal, "x/fit")
-    assert "\n" not in str(refused.value)
 
 
 def test_nothing_to_fit(twin: Twin, dragged: list[Episode]) -> None:

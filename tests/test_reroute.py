@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
 import sys
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bench_modules import loaded_modules
 
 from pred_core.errors import ConfigError, TwinError
 from pred_core.plan.config import MotionConfig, PlannerConfig
@@ -32,16 +32,7 @@ MODULES = ("hidden_scores", "measured_cables", "reroute_cell", "reroute_eyes", "
 
 @pytest.fixture(scope="module")
 def bench() -> Iterator[dict[str, ModuleType]]:
-    """The benchmark's modules, each under its own name, since they import one another."""
-    loaded = {}
-    for name in MODULES:
-        spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-        assert spec is not None and spec.loader is not None
-        sys.modules[name] = loaded[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(loaded[name])
-    yield loaded
-    for name in MODULES:
-        del sys.modules[name]
+    yield from loaded_modules(MODULES)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,128 @@
+"""What the diagnosis says of evidence is exact: family-wise errors, lack of fit, rivals, the simpler law."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from report_cases import judged, rope
+
+from pred_core.diagnose import evidence
+from pred_core.diagnose.config import DiagnoseConfig
+from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals, set_limit, simplest
+from pred_core.diagnose.trial import make_trial
+from pred_core.effects import find_effect
+from pred_core.twin import Twin
+from pred_core.types import Array
+
+SPLITS = ("train",) * 5 + ("test",)
+SMALL = DiagnoseConfig(places=4, survivors=3, iterations=6)
+
+
+@pytest.fixture(scope="module")
+def twin() -> Twin:
+    return rope()
+
+
+def gains(twin: Twin, rows: Array) -> list[Judged]:
+    return [judged(twin, "drag_linear", 1.0, 0.1, row.tolist()) for row in rows]
+
+
+def test_family_wise_errors_are_what_they_say(twin: Twin, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four correlated candidates on ten episodes, nothing in them, 400 times: the smallest adjusted p is below 0.05
+    in 20 of them. 99.9 % of Binomial(400, 0.05) lies in 7..36; of Binomial(400, 0.5) in 167..233.
+    """
+    monkeypatch.setattr(evidence, "FLIPS", 999)
+    rng = np.random.default_rng(1)
+    smallest = []
+    for seed in range(400):
+        shared = rng.standard_t(3, size=10)
+        smallest.append(family_wise(gains(twin, shared + rng.standard_t(3, size=(4, 10))), seed).min())
+    p = np.array(smallest)
+    assert 7 <= (p <= 0.05).sum() <= 36
+    assert 167 <= (p <= 0.5).sum() <= 233
+
+
+def test_a_shift_is_found_among_candidates_without_one(twin: Twin) -> None:
+    """Gains of 2 +- 1 on 12 episodes: t = 7. Sign flips reach that once in 4096; with 5 candidates below 0.005."""
+    rng = np.random.default_rng(0)
+    rows = rng.normal(0.0, 1.0, (5, 12))
+    rows[3] += 2.0
+    p = family_wise(gains(twin, rows), 0)
+    assert p[3] < 0.005 and (np.delete(p, 3) > 0.05).all()
+
+
+def test_episodes_that_fit_worse_are_told() -> None:
+    """Losses have a scale of their own, so their logs are compared. On 8 against 8 episodes a factor of 3 over a
+    scatter of 30 % is 5 standard errors; nothing is told of 2 episodes.
+    """
+    rng = np.random.default_rng(0)
+    one, other = 3.0 * np.exp(rng.normal(0, 0.3, 8)), np.exp(rng.normal(0, 0.3, 8))
+    ground = np.zeros(8, dtype=bool)
+    assert lack_of_fit(one, other, 0, ground, ground) < 0.001
+    assert lack_of_fit(other, one, 0, ground, ground) > 0.9  # one-sided
+    assert lack_of_fit(1e3 * one, 1e3 * other, 0, ground, ground) == lack_of_fit(one, other, 0, ground, ground)
+    assert lack_of_fit(one[:2], other, 0, ground[:2], ground) == 1.0
+
+
+def test_a_lack_of_fit_on_the_ground_alone_is_told() -> None:
+    """Half of the episodes lie; only these fit worse. Pooled, a factor of 2 in half of them would drown in 30 times
+    larger losses on the ground; apart it is 5 standard errors, doubled for two tests.
+    """
+    rng = np.random.default_rng(2)
+    ground = np.arange(16) % 2 == 0
+    scale = np.where(ground, 30.0, 1.0)
+    one = scale * np.where(ground, 3.0, 1.0) * np.exp(rng.normal(0, 0.3, 16))
+    other = scale * np.exp(rng.normal(0, 0.3, 16))
+    assert lack_of_fit(one, other, 0, ground, ground) < 0.005
+
+
+def test_lack_of_fit_errs_as_often_as_it_says() -> None:
+    """120 draws of 6 against 6 in the air and 6 against 6 on the ground: two tests at 2.5 % err in 1 - 0.975^2 = 4.9 %
+    of them, 6. 99.9 % of Binomial(120, 0.049) lies below 15; none at all has a probability of 0.2 %.
+    """
+    rng = np.random.default_rng(3)
+    ground = np.arange(12) % 2 == 0
+    losses = np.exp(rng.normal(0, 1, (120, 2, 12)))
+    p = np.array([lack_of_fit(one, other, n, ground, ground) for n, (one, other) in enumerate(losses)])
+    assert 1 <= (p <= 0.05).sum() <= 14
+
+
+def nested(twin: Twin, share: float) -> tuple[Judged, Judged]:
+    """Drag with one number, saving `share` of what attraction with more numbers saves, on 10 episodes."""
+    rich = np.linspace(1.0, 2.0, 10)
+    many = make_trial(twin, (find_effect("attraction"),))
+    plain = judged(twin, "drag_linear", 1.0, 0.1, (share * rich).tolist())
+    names = [k.name for k in many.space.knobs]
+    flexible = dataclasses.replace(
+        plain,
+        trial=many,
+        gain=rich,
+        values=dict.fromkeys(names, 1.0),
+        null=dict.fromkeys(names, 0.0),
+        intervals=dict.fromkeys(names, (0.9, 1.1)),
+        z=np.zeros(len(names)),
+    )
+    return plain, flexible
+
+
+def test_the_simpler_law_is_preferred_when_it_explains_as_much(twin: Twin) -> None:
+    plain, flexible = nested(twin, 0.98)
+    assert plain.parameters == 1 < flexible.parameters
+    assert simplest([flexible, plain], flexible) is plain
+    plain, flexible = nested(twin, 0.8)  # always 20 % less: many standard errors, and beyond a tenth
+    assert simplest([flexible, plain], flexible) is flexible
+    assert simplest([flexible, plain], plain) is plain  # more numbers are never preferred
+
+
+def test_rivals_are_counted_in_standard_errors(twin: Twin) -> None:
+    """Differences 1, 2, 3, 4 have mean 2.5 and standard error 1.291 / 2: 3.873; limit t(3) at 90 %: 1.638."""
+    best, other = gains(twin, np.array([[5.0, 5.0, 5.0, 5.0], [4.0, 3.0, 2.0, 1.0]]))
+    rows = rivals([other, best], best)
+    assert rows[0][0] is best and rows[0][1] == 0.0
+    assert rows[1][1] == pytest.approx(2.5 / (1.2909944 / 2.0))
+    assert set_limit(4) == pytest.approx(1.6377, abs=1e-4)
+
+
+# Samples, restarts, weights -------------------------------------------------------------------------------------------

@@ -1,0 +1,66 @@
+"""A journal belongs to its data and settings, and what no diagnosis wrote is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pred_core.diagnose.commission import commission, values_of
+from pred_core.diagnose.config import DiagnoseConfig
+from pred_core.diagnose.journal import Journal
+from pred_core.diagnose.judge import judge, quick, screen
+from pred_core.effects import find_effect
+from pred_core.errors import ConfigError
+from pred_core.twin import Twin
+from pred_core.types import Episode
+
+SPLITS = ("train",) * 5 + ("test",)
+SMALL = DiagnoseConfig(places=4, survivors=3, iterations=6)
+
+
+def test_a_journal_belongs_to_its_data(tmp_path: Path) -> None:
+    path = tmp_path / "journal.jsonl"
+    assert Journal(path, {"data": "a"}).once("x", lambda: [1.0]) == [1.0]
+    assert Journal(path, {"data": "a"}).once("x", lambda: [2.0]) == [1.0]
+    other = Journal(path, {"data": "b"})
+    assert other.once("x", lambda: [3.0]) == [3.0]
+    assert '"a"' in (tmp_path / "journal.old.jsonl").read_text()
+    assert '"a"' not in path.read_text()
+
+
+@pytest.mark.parametrize("line", ["not a line", '{"key": "x"}', "[1, 2]", "3"])
+def test_a_damaged_journal_is_refused(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "journal.jsonl"
+    Journal(path, {}).once("x", lambda: 1)
+    path.write_text(path.read_text() + line + "\n")
+    with pytest.raises(ConfigError, match=r"journal\.jsonl: is damaged.*Delete it") as refused:
+        Journal(path, {})
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("base", 3), ("base", {"physics": {"stiffness": "soft"}, "extensions": []}), ("x/screen", []),
+     ("x/screen", [[[0.1, 0.2], 1.0]]), ("x/quick", [[None], 1.0]), ("x/fit", {"z": [1.0]}),
+     ("x/fit", {"z": [1.0], "null": [0.0], "left_out": [[1.0]], "gain": [1.0], "moved": [1.0], "extended": [1.0]})],
+)  # fmt: skip
+def test_a_value_that_no_diagnosis_wrote_is_refused(
+    twin: Twin, reference: list[Episode], tmp_path: Path, key: str, value: Any
+) -> None:
+    """The line is whole, what it says is not: text for a number, nothing, a coordinate too many, an episode too few."""
+    path = tmp_path / "journal.jsonl"
+    Journal(path, {}).once("base", lambda: values_of(twin))
+    lines = [line for line in path.read_text().splitlines() if f'"{key}"' not in line]
+    path.write_text("\n".join([*lines, json.dumps({"key": key, "value": value})]) + "\n")
+    journal = Journal(path, {})
+    said = f"journal.jsonl: the value of '{key}' is damaged.*Delete the file"
+    with pytest.raises(ConfigError, match=said) as refused:
+        bench = commission(twin, reference[:2], reference[2:4], SMALL, quiet, journal)
+        found = screen(bench, (find_effect("drag_linear"),), np.random.default_rng(0), journal, "x/screen")
+        quick(bench, found, journal, "x/quick")
+        judge(bench, found, journal, "x/fit")
+    assert "\n" not in str(refused.value)
