@@ -9,15 +9,11 @@ import pytest
 from report_cases import judged, rope
 
 from pred_core.diagnose import evidence
-from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals, set_limit, simplest
 from pred_core.diagnose.trial import make_trial
 from pred_core.effects import find_effect
 from pred_core.twin import Twin
 from pred_core.types import Array
-
-SPLITS = ("train",) * 5 + ("test",)
-SMALL = DiagnoseConfig(places=4, survivors=3, iterations=6)
 
 
 @pytest.fixture(scope="module")

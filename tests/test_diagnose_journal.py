@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from report_cases import recorded, rope
 
 from pred_core.diagnose.commission import commission, values_of
 from pred_core.diagnose.config import DiagnoseConfig
@@ -20,6 +21,20 @@ from pred_core.types import Episode
 
 SPLITS = ("train",) * 5 + ("test",)
 SMALL = DiagnoseConfig(places=4, survivors=3, iterations=6)
+
+
+def quiet(_: str) -> None:
+    """No progress."""
+
+
+@pytest.fixture(scope="module")
+def twin() -> Twin:
+    return rope()
+
+
+@pytest.fixture(scope="module")
+def reference(twin: Twin) -> list[Episode]:
+    return recorded(twin, (), SPLITS, seed=100, frames=40)
 
 
 def test_a_journal_belongs_to_its_data(tmp_path: Path) -> None:
