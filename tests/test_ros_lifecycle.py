@@ -11,43 +11,22 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from live_world import START, STEP, Straight, make_twin
-from ros_bench import Bench, bench_of
-
-from pred_core.types import Grip, State
-from pred_ros.predictor_node import PredictorNode
+from live_world import START, STEP
+from predictor_bench import SlowPredictor, predictor_bench
+from ros_bench import Bench
 
 WARN = DiagnosticStatus.WARN
 
 
-class StraightPredictor(PredictorNode):
-    """The node with a Dynamics whose result is known by hand."""
-
-    MAKE_DYNAMICS = staticmethod(lambda twin: Straight())
-
-
-@pytest.fixture(scope="module")
-def twin(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_twin(tmp_path_factory.mktemp("twin") / "line")
-
-
 @pytest.fixture
-def bench(twin: Path) -> Iterator[Bench]:
-    with bench_of(StraightPredictor, {"twin": str(twin), "held": "'0:0'", "overload": "queue"}) as made:
+def bench(straight_twin: Path) -> Iterator[Bench]:
+    with predictor_bench(straight_twin) as made:
         yield made
 
 
-def test_too_slow_drops_to_the_newest_data_and_says_so(twin: Path) -> None:
-    class Slow(Straight):
-        def step(self, state: State, grip: Grip) -> State:
-            time.sleep(0.02)  # twice the period
-            return super().step(state, grip)
+def test_too_slow_drops_to_the_newest_data_and_says_so(straight_twin: Path) -> None:
+    with predictor_bench(straight_twin, SlowPredictor, overload="newest", max_backlog="0.1") as bench:
 
-    class SlowPredictor(PredictorNode):
-        MAKE_DYNAMICS = staticmethod(lambda _: Slow())
-
-    parameters = {"twin": str(twin), "held": "'0:0'", "overload": "newest", "max_backlog": "0.1"}
-    with bench_of(SlowPredictor, parameters) as bench:
         def heard() -> int:
             return bench.node.diagnostics.counter("messages on tracker/points")
 
@@ -74,17 +53,8 @@ def test_too_slow_drops_to_the_newest_data_and_says_so(twin: Path) -> None:
         assert "too slow" not in bench.node.diagnostics.message, "six seconds later it does not"
 
 
-def test_queue_keeps_every_message_however_slow(twin: Path) -> None:
-    class Slow(Straight):
-        def step(self, state: State, grip: Grip) -> State:
-            time.sleep(0.02)
-            return super().step(state, grip)
-
-    class SlowPredictor(PredictorNode):
-        MAKE_DYNAMICS = staticmethod(lambda _: Slow())
-
-    parameters = {"twin": str(twin), "held": "'0:0'", "overload": "queue", "max_backlog": "0.1"}
-    with bench_of(SlowPredictor, parameters) as bench:
+def test_queue_keeps_every_message_however_slow(straight_twin: Path) -> None:
+    with predictor_bench(straight_twin, SlowPredictor, max_backlog="0.1") as bench:
         for frame in range(60):
             bench.feed(frame)
         bench.until(lambda: len(bench.predictions) == 58, "all of them")
@@ -116,17 +86,8 @@ def test_cleanup_leaves_nothing_and_the_node_can_be_configured_again(bench: Benc
     assert node._worker is None and made() == idle, "shutdown from active ends the work"
 
 
-def test_a_worker_within_a_long_horizon_ends_at_once(twin: Path) -> None:
-    class Slow(Straight):
-        def step(self, state: State, grip: Grip) -> State:
-            time.sleep(0.02)
-            return super().step(state, grip)
-
-    class SlowPredictor(PredictorNode):
-        MAKE_DYNAMICS = staticmethod(lambda _: Slow())
-
-    parameters = {"twin": str(twin), "held": "'0:0'", "horizon": "5.0", "overload": "queue"}
-    with bench_of(SlowPredictor, parameters) as bench:
+def test_a_worker_within_a_long_horizon_ends_at_once(straight_twin: Path) -> None:
+    with predictor_bench(straight_twin, SlowPredictor, horizon="5.0") as bench:
         for frame in range(10):
             bench.feed(frame)
         bench.until(lambda: bench.node._predictor.counts.steps > 0, "it steps; 500 steps of 20 ms follow")

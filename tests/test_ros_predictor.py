@@ -12,7 +12,8 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from live_world import CLOSED, COUNT, PERIOD, START, STEP, Straight, make_twin, points, pose
+from live_world import CLOSED, COUNT, PERIOD, START, STEP, Straight, points, pose
+from predictor_bench import predictor_bench
 from ros_bench import Bench, bench_of
 from std_srvs.srv import Trigger
 
@@ -25,26 +26,15 @@ from pred_ros.predictor_node import PredictorNode
 ERROR, WARN = DiagnosticStatus.ERROR, DiagnosticStatus.WARN
 
 
-class StraightPredictor(PredictorNode):
-    """The node with a Dynamics whose result is known by hand."""
-
-    MAKE_DYNAMICS = staticmethod(lambda twin: Straight())
-
-
 class DivergingPredictor(PredictorNode):
     """The node with a Dynamics that leaves the finite numbers at its fourth step."""
 
     MAKE_DYNAMICS = staticmethod(lambda twin: Straight(diverges_after=3))
 
 
-@pytest.fixture(scope="module")
-def twin(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_twin(tmp_path_factory.mktemp("twin") / "line")
-
-
 @pytest.fixture
-def bench(twin: Path) -> Iterator[Bench]:
-    with bench_of(StraightPredictor, {"twin": str(twin), "held": "'0:0'", "overload": "queue"}) as made:
+def bench(straight_twin: Path) -> Iterator[Bench]:
+    with predictor_bench(straight_twin) as made:
         yield made
 
 
@@ -60,9 +50,8 @@ def test_prediction_carries_the_stamp_of_the_pose_and_the_hand_worked_place(benc
     assert last.held.tolist() == [0, -1, -1, -1, -1]
 
 
-def test_horizon_stands_in_the_stamp(twin: Path) -> None:
-    parameters = {"twin": str(twin), "held": "'0:0'", "horizon": "0.05", "overload": "queue"}
-    with bench_of(StraightPredictor, parameters) as bench:
+def test_horizon_stands_in_the_stamp(straight_twin: Path) -> None:
+    with predictor_bench(straight_twin, horizon="0.05") as bench:
         for frame in range(5):
             bench.feed(frame)
         bench.until(lambda: len(bench.predictions) >= 3, "predictions")
@@ -73,7 +62,7 @@ def test_horizon_stands_in_the_stamp(twin: Path) -> None:
         assert state.position[4, 0] == pytest.approx(0.245, abs=2e-6)
 
 
-def test_correction_follows_the_tracks_and_open_loop_does_not(twin: Path) -> None:
+def test_correction_follows_the_tracks_and_open_loop_does_not(straight_twin: Path) -> None:
     def moved(frame: int) -> PointFrame:
         """From frame 5 on everything is measured 2 cm higher."""
         seen = points(frame)
@@ -82,7 +71,7 @@ def test_correction_follows_the_tracks_and_open_loop_does_not(twin: Path) -> Non
 
     heights = {}
     for mode in ("none", "tracks"):
-        with bench_of(StraightPredictor, {"twin": str(twin), "correct": mode, "overload": "queue"}) as bench:
+        with predictor_bench(straight_twin, correct=mode) as bench:
             for frame in range(12):
                 bench.points_out.publish(convert.points_to_cloud(moved(frame)))
             bench.until(lambda: bench.node.diagnostics.counter("messages on tracker/points") == 12, "points")  # noqa: B023
@@ -196,9 +185,8 @@ def test_hidden_particle_is_named_while_no_start_is_possible(bench: Bench) -> No
     assert not bench.predictions
 
 
-def test_divergence_stops_before_the_wire_and_reset_starts_anew(twin: Path) -> None:
-    parameters = {"twin": str(twin), "held": "'0:0'", "overload": "queue"}
-    with bench_of(DivergingPredictor, parameters) as bench:
+def test_divergence_stops_before_the_wire_and_reset_starts_anew(straight_twin: Path) -> None:
+    with predictor_bench(straight_twin, DivergingPredictor) as bench:
         for frame in range(10):
             bench.feed(frame)
         bench.until(lambda: bench.says(ERROR, "diverged at stamp 7.050 s", "~/reset"), "an error with the stamp")
@@ -228,15 +216,15 @@ def test_poses_twice_as_fast_are_taken_at_the_period(bench: Bench) -> None:
     assert bench.node._predictor.counts.interpolated == 0
 
 
-def test_twin_of_another_rate_is_said(tmp_path: Path, twin: Path) -> None:
+def test_twin_of_another_rate_is_said(tmp_path: Path, straight_twin: Path) -> None:
     class Slow(Straight):
         period = 1 / 30
 
     class SlowPredictor(PredictorNode):
         MAKE_DYNAMICS = staticmethod(lambda _: Slow())
 
-    assert Twin.load(twin).body.count == COUNT
-    with bench_of(SlowPredictor, {"twin": str(twin), "overload": "queue"}) as bench:
+    assert Twin.load(straight_twin).body.count == COUNT
+    with bench_of(SlowPredictor, {"twin": str(straight_twin), "overload": "queue"}) as bench:
         frame = itertools.count()
 
         def feed() -> bool:

@@ -12,32 +12,21 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from live_world import CLOSED, COUNT, PERIOD, START, STEP, Straight, make_twin, points, pose
-from ros_bench import Bench, bench_of
+from live_world import CLOSED, COUNT, PERIOD, START, STEP, points, pose
+from predictor_bench import predictor_bench
+from ros_bench import Bench
 
 from pred_core.errors import ConfigError
 from pred_ros import convert
-from pred_ros.predictor_node import PredictorConfig, PredictorNode, check
+from pred_ros.predictor_node import PredictorConfig, check
 
 ERROR, WARN, OK = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
 STOP = 3.0  # [s]
 
 
-class StraightPredictor(PredictorNode):
-    """The node with a Dynamics whose result is known by hand."""
-
-    MAKE_DYNAMICS = staticmethod(lambda twin: Straight())
-
-
-@pytest.fixture(scope="module")
-def twin(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_twin(tmp_path_factory.mktemp("twin") / "line")
-
-
 @pytest.fixture
-def bench(twin: Path) -> Iterator[Bench]:
-    parameters = {"twin": str(twin), "held": "'0:0'", "mode": "estimate", "overload": "queue", "stop_after": str(STOP)}
-    with bench_of(StraightPredictor, parameters) as made:
+def bench(straight_twin: Path) -> Iterator[Bench]:
+    with predictor_bench(straight_twin, mode="estimate", stop_after=str(STOP)) as made:
         yield made
 
 
