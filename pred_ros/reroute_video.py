@@ -43,26 +43,29 @@ def write_video(record: Record, path: Path) -> int:
         writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"VP80"), rate, SIZE)
     if not writer.isOpened():
         raise ConfigError("this OpenCV cannot write VP8 video", next_step="pip install 'opencv-python-headless<5'")
+    height, width = _decoded(frames[0][1]).shape[:2]
+    view, part = closer(record, record.view, width, height)
     for stamp, jpeg in frames:
-        picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-        view, part = closer(record, record.view, picture)
-        writer.write(draw(record, view, stamp, part))
+        picture = cv2.warpAffine(_decoded(jpeg), part, SIZE)
+        writer.write(draw(record, view, stamp, picture))
     writer.release()
     return len(frames)
 
 
-def closer(record: Record, view: View, picture: Picture) -> tuple[View, Picture]:
-    """The part of a picture (H, W, 3) in which goal and rope lie, enlarged to SIZE, and the camera that sees it so."""
-    height, width = picture.shape[:2]
+def closer(record: Record, view: View, width: int, height: int) -> tuple[View, Array]:
+    """The camera that sees only the part in which goal and rope lie, enlarged to SIZE, and that part (2, 3): its pixels
+    from those of a picture of width x height. Where nothing lies in front of the camera: the middle.
+    """
     seen = np.concatenate([project(view, record.goal), *[project(view, p) for _, p in record.truth[::20]]])
+    if not len(seen):
+        seen = np.array([[0, 0], [width, height]], np.int32)
     low, high = seen.min(axis=0), seen.max(axis=0)
     wanted = float((np.array(SIZE) / (1.0 + 2.0 * MARGIN) / np.maximum(high - low, 1)).min())
     scale = max(wanted, SIZE[0] / width, SIZE[1] / height)
     span = np.array(SIZE) / scale
     corner = np.clip((low + high) / 2 - span / 2, 0.0, np.array([width, height]) - span)
     turn = np.array([[scale, 0.0, -scale * corner[0]], [0.0, scale, -scale * corner[1]], [0.0, 0.0, 1.0]])
-    part = _opencv().warpAffine(picture, turn[:2], SIZE)
-    return View(view.name, turn @ view.intrinsics, view.world_from_camera), part
+    return View(view.name, turn @ view.intrinsics, view.world_from_camera), turn[:2]
 
 
 def draw(record: Record, view: View, stamp: int, picture: Picture) -> Picture:
@@ -97,6 +100,12 @@ def project(view: View, points: Array) -> NDArray[np.int32]:
     p_camera = p_camera[p_camera[:, 2] > NEAR]
     pixels = p_camera @ view.intrinsics.T
     return np.round(pixels[:, :2] / pixels[:, 2:]).astype(np.int32)
+
+
+def _decoded(jpeg: bytes) -> Picture:
+    """(H, W, 3) BGR."""
+    cv2 = _opencv()
+    return np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), np.uint8)
 
 
 def _write(picture: Picture, text: str, place: tuple[int, int], colour: tuple[int, int, int]) -> None:
