@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +17,14 @@ from reroute_cell import DrivenCell, show_goal
 from reroute_eyes import CameraEyes, Eyes, TrueEyes
 
 from pred_core.config import setting
-from pred_core.errors import ConfigError, DivergenceError, InputError, TwinError
+from pred_core.errors import DivergenceError, InputError, TwinError
 from pred_core.metrics.chamfer import chamfer_two_sided
 from pred_core.plan.config import PlannerConfig
-from pred_core.plan.latency import Observation, tracking_error
-from pred_core.plan.plan import NS, Plan
+from pred_core.plan.latency import Observation
+from pred_core.plan.plan import Plan
 from pred_core.plan.planner import Planner
-from pred_core.plan.task import make_planner, planning_dynamics, scene_with_slot
+from pred_core.plan.session import Session, Timing
+from pred_core.plan.task import make_planner, planning_dynamics, scene_with_slot, with_gap
 from pred_core.plant.cameras import ring_of_cameras
 from pred_core.plant.live.cell import WORKPLACE, Cell, CellConfig
 from pred_core.plant.live.slot import SlotConfig
@@ -29,7 +32,8 @@ from pred_core.plant.live.station import Moment
 from pred_core.twin import Twin
 from pred_core.types import Array
 
-OFF_TRACK = 0.04  # [m] off the plan in force, it is given up; as the planner node's default
+TICK = 1e-9  # [s] the planner's clock goes on by whenever it is asked: budgets are motions here, not seconds
+MakePlanner = Callable[[Array, Callable[[], float]], Planner]  # of a goal (Q, 3) [m] and a clock [s]
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class TrialConfig:
     gap: float = setting(SlotConfig.gap, unit="m", low=0.01, high=0.1, doc="between the posts")
     cable: int = setting(0, low=0, high=2**31 - 1, doc="0: the nominal cable; else the seed of a drawn one")
     replan: float = setting(0.4, unit="s", low=0.1, high=5.0, doc="simulated time between plans")
-    latency: float = setting(0.2, unit="s", low=0.0, high=2.0, doc="simulated time from an observation to its plan")
+    latency: float = setting(0.2, unit="s", low=0.01, high=2.0, doc="simulated time from an observation to its plan")
     limit: float = setting(16.0, unit="s", low=1.0, high=120.0, doc="simulated time of a trial")
 
 
@@ -64,8 +68,11 @@ def run_trial(
         slotted = with_gap(settings, config.gap)
         dynamics = planning_dynamics(twin, scene_with_slot(twin.scene, slotted))
         eyes: Eyes = CameraEyes(twin, cell, dynamics) if cameras else TrueEyes(twin)
-        planner = make_planner(twin, goal, slotted, seed, dynamics=dynamics)
-        trial = Trial(driven, eyes, planner, config, goal)
+
+        def make(points: Array, clock: Callable[[], float]) -> Planner:
+            return make_planner(twin, points, slotted, seed, dynamics=dynamics, clock=clock)
+
+        trial = Trial(driven, eyes, make, config, goal)
         outcome = trial.run(driven.begin(seed))
         touches = cell.touches
         return {
@@ -76,6 +83,7 @@ def run_trial(
             "chamfer": trial.chamfer,
             "replans": trial.replans,
             "refused": trial.refused,
+            "session": dataclasses.asdict(trial.session.counts),
             "unseen": trial.unseen,
             "state_error_mm": trial.errors,
             "touch_count": touches.count,
@@ -89,15 +97,19 @@ def run_trial(
 
 
 class Trial:
-    """The loop of one trial, and what it writes down."""
+    """The loop of one trial, and what it writes down. It plans with the planner node's `Session`."""
 
     def __init__(
-        self, driven: DrivenCell, eyes: Eyes, planner: Planner, config: TrialConfig, goal: Array, slot: bool = True
+        self, driven: DrivenCell, eyes: Eyes, make: MakePlanner, config: TrialConfig, goal: Array, slot: bool = True
     ):
         """slot False: the task is another one, and only time ends the trial."""
         self._slot = slot
-        self._driven, self._eyes, self._planner, self._config, self._goal = driven, eyes, planner, config, goal
-        self._force: Plan | None = None
+        self._driven, self._eyes, self._config, self._goal = driven, eyes, config, goal
+        clock = ticking()
+        timing = Timing(budget=config.latency, margin=0.0)
+        self.session = Session(lambda p: make(p, clock), timing, lambda: driven.station.stamp, clock=clock)
+        self.session.set_goal(goal)
+        self._warm = False
         self._began = 0.0  # [s] of the cell
         self.chamfer: list[tuple[float, float]] = []  # [s], [m] of the true rope to the goal
         self.replans: list[dict[str, float]] = []
@@ -133,26 +145,25 @@ class Trial:
             return
         truth = self._driven.station.moment.truth.rope
         self.errors.append(round(1e3 * float(np.linalg.norm(seen.state.position.numpy() - truth, axis=1).mean()), 3))
-        if self._force is not None and tracking_error(seen, self._force) > OFF_TRACK:
-            self._force = None
-            self._planner.reset()
         wall, cpu = time.perf_counter(), time.process_time()
         plan = self._plan(seen)
         if plan is None:
             return
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        self.session.commit(plan)
         line = self._driven.follow(plan)
         if line is not None:
             self.refused.append(line)
             return
-        self._force = plan
         self.replans.append({"at": self._time(), "wall": round(wall, 4), "cpu": round(cpu, 4), "cost": plan.cost,
                              "still": plan.still, "motions": plan.motions, "steps": plan.steps})  # fmt: skip
 
     def _plan(self, seen: Observation) -> Plan | None:
-        begin = self._driven.station.stamp + round(self._config.latency * NS)
         try:
-            return self._planner.plan(seen, begin, in_force=self._force)
+            if not self._warm:  # a session's first run compiles and plans nothing; no simulated time passes here
+                self.session.replan(seen)
+                self._warm = True
+            return self.session.replan(seen)
         except (InputError, DivergenceError) as error:
             self.refused.append(str(error))
             return None
@@ -164,6 +175,12 @@ class Trial:
 
     def _time(self) -> float:
         return round(self._driven.station.cell.time - self._began, 3)
+
+
+def ticking() -> Callable[[], float]:
+    """A clock [s] that goes on by TICK whenever it is asked."""
+    ticks = itertools.count()
+    return lambda: TICK * next(ticks)
 
 
 def goal_of(cell: Cell, config: TrialConfig, seed: int, goals: Path | None) -> Array:
@@ -189,10 +206,3 @@ def check_twin(twin: Twin) -> None:
     even = np.linspace(0.0, 1.0, twin.body.count)
     if twin.body.kind != "line" or np.abs(twin.body.arc - even).max() > 0.01 or not twin.meta.held:
         raise TwinError("the twin is no rope of the cell", next_step="Make one with the command 'twin'")
-
-
-def with_gap(settings: PlannerConfig, gap: float) -> PlannerConfig:
-    """The planner's settings with the slot of the cell. Raises: ConfigError without a slot."""
-    if settings.slot is None:
-        raise ConfigError("the planner's settings have no slot", next_step="Use config/plan/slot.yaml")
-    return dataclasses.replace(settings, slot=dataclasses.replace(settings.slot, gap=gap))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -29,6 +30,7 @@ from pred_core.bag.deform import SOURCE_FILE, claim_folder
 from pred_core.cli.main import BAD_INPUT
 from pred_core.errors import PredError
 from pred_core.plan.config import PlannerConfig
+from pred_core.plan.planner import Planner
 from pred_core.plan.task import load_settings, make_planner
 from pred_core.plant.live.cell import Truth
 from pred_core.plant.live.mover import Segment, ToolPose
@@ -83,8 +85,11 @@ def run_task(twin: Twin, settings: PlannerConfig, config: TrialConfig, task: str
         truth = truth if first is None else go(shown, first).truth
         goal = go(shown, way(task, truth, cell.reference, settings)).truth.rope
         driven = DrivenCell(cell, pictures=False)
-        planner = make_planner(twin, goal, settings, seed)
-        trial = Trial(driven, TrueEyes(twin), planner, config, goal, slot=False)
+
+        def make(points: Array, clock: Callable[[], float]) -> Planner:
+            return make_planner(twin, points, settings, seed, clock=clock)
+
+        trial = Trial(driven, TrueEyes(twin), make, config, goal, slot=False)
         outcome = trial.run(driven.begin(seed, first))
         return {"seed": seed, "outcome": outcome, "chamfer": trial.chamfer, "replans": trial.replans,
                 "refused": trial.refused, "way": trial.way, "goal": np.round(goal, 5).tolist()}  # fmt: skip

@@ -35,7 +35,7 @@ from pred_core.plan.plan import NS, Plan
 from pred_core.plan.planner import Planner
 from pred_core.plan.rollouts import Rollouts
 from pred_core.plan.session import Session, Timing
-from pred_core.plan.task import load_settings, make_planner, planning_dynamics, scene_with_slot
+from pred_core.plan.task import load_settings, make_planner, planning_dynamics, scene_with_slot, with_gap
 from pred_core.twin import Twin
 from pred_core.types import Array, Scene
 from pred_ros import convert, planner_messages, qos, shell
@@ -53,6 +53,7 @@ class PlannerNodeConfig(Timing):
 
     twin: str = setting("", doc="folder of the twin")
     settings: str = setting("", doc="YAML file of motion, search, costs and slot; empty: the defaults")
+    gap: float = setting(0.0, unit="m", low=0.0, high=1.0, doc="between the posts of the slot; 0: as in the settings")
     enabled: bool = setting(False, doc="plan without waiting for ~/enable")
     device: str = setting("cpu", choices=("cpu", "cuda"), doc="where motions are simulated")
     pose_gap: float = setting(0.05, unit="s", low=0.001, high=1.0, doc="farthest gripper pose from a state's stamp")
@@ -90,7 +91,8 @@ class PlannerNode(Shell):
             )
         torch.set_num_threads(config.threads)
         self._twin = Twin.load(Path(config.twin))
-        self._settings = load_settings(config.settings)
+        settings = load_settings(config.settings)
+        self._settings = with_gap(settings, config.gap) if config.gap > 0.0 else settings
         scene = scene_with_slot(self._twin.scene, self._settings)
         self._dynamics = type(self).MAKE_DYNAMICS(self._twin, scene, config.device)
         self._plan_out = self.create_publisher(MultiDOFJointTrajectory, PLAN_TRAJECTORY, qos.plans())

@@ -25,6 +25,7 @@ from pred_core.cli.main import BAD_INPUT, INTERRUPTED
 from pred_core.errors import ConfigError, PredError
 from pred_core.plan.endpoints import read_cloud
 from pred_core.plan.goal import size_of
+from pred_core.plan.task import load_settings
 from pred_core.plant.live.slot import SlotConfig
 from pred_core.twin import Twin
 from pred_core.types import Array
@@ -114,7 +115,10 @@ def check_times(args: argparse.Namespace) -> None:
 
 
 def prepare(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
-    """Parameters of every node: the file's, a free port, the twin, the planner's settings, then the overrides."""
+    """Parameters of every node: the file's, a free port, the twin, the planner's settings, then the overrides.
+
+    Planner and tracker are told the plant's gap.
+    """
     nodes = read_nodes(args.nodes)
     missing = [n for n in NODES if n not in nodes]
     if missing:
@@ -128,7 +132,18 @@ def prepare(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     nodes["planner"].setdefault("settings", str(config_folder() / "plan" / "slot.yaml"))
     nodes["planner"]["seed"] = args.seed
     apply_overrides(nodes, args.overrides)
+    slot = SlotConfig(gap=float(str(nodes["plant"].get("gap", SlotConfig.gap))))
+    if load_settings(nodes["planner"]["settings"]).slot is not None:
+        nodes["planner"].setdefault("gap", slot.gap)
+    if not any(o.startswith("tracker.fixtures=") for o in args.overrides):
+        nodes["tracker"]["fixtures"] = fixtures_of(slot)
     return nodes
+
+
+def fixtures_of(slot: SlotConfig) -> str:
+    """The posts as the tracker's parameter: 'x y z hx hy hz; ...' [m], boxes along the axes of world."""
+    turn = np.abs(slot.world_from_slot[:3, :3])
+    return "; ".join(" ".join(f"{v:.4f}" for v in (*b.center, *(turn @ b.half_size))) for b in slot.boxes)
 
 
 def free_port() -> int:

@@ -18,7 +18,7 @@ from pred_core.errors import ConfigError, TwinError
 from pred_core.plan.config import MotionConfig, PlannerConfig
 from pred_core.plan.curve import Curve
 from pred_core.plan.knots import KnotLimits
-from pred_core.plan.task import load_settings
+from pred_core.plan.task import load_settings, with_gap
 from pred_core.plan.ways import draw_ways
 from pred_core.plant.live.slot import SlotConfig
 from pred_core.springmass import build_body
@@ -79,6 +79,19 @@ def test_a_trial_is_repeatable_bit_for_bit(bench, twin: Twin, settings: PlannerC
     assert first["state_error_mm"] == [0.0, 0.0, 0.0], "true eyes see the truth"
     moved = np.linalg.norm(np.array(first["way"][-1]) - first["way"][0])
     assert 0.02 < moved < 0.24, "the arm followed, no faster than 0.22 m/s from 0.2 s on"
+
+
+def test_a_plan_the_arm_does_not_follow_is_given_up(bench, twin, settings, tmp_path: Path, monkeypatch) -> None:
+    """As in the planner node: more than 4 cm off what is in force, then nothing until the arm has rested."""
+    goal_file(bench, tmp_path, 3)
+    trial = bench["reroute_trial"]
+    monkeypatch.setattr(bench["reroute_cell"].DrivenCell, "follow", lambda self, plan: None)
+    result = trial.run_trial(twin, settings, trial.TrialConfig(limit=2.0), 3, tmp_path)
+    assert np.ptp(result["way"], axis=0).max() < 2e-3, "the arm stands"
+    # What the arm was told moves on by up to 0.22 m/s; looks come every 0.4 s, a rest is seen by two of them.
+    counts = result["session"]
+    assert counts["off_track"] >= 1 and counts["moving"] >= 1
+    assert counts["plans"] == len(result["replans"]) and counts["plans"] + counts["moving"] == 5
 
 
 def test_what_is_there_is_kept(bench, twin: Twin, tmp_path: Path, monkeypatch, capsys) -> None:
@@ -188,4 +201,4 @@ def test_unusable_twins_and_settings_are_refused(bench, twin: Twin, settings: Pl
     with pytest.raises(TwinError, match="no rope of the cell"):
         trial.check_twin(twin.replace(meta=dataclasses.replace(twin.meta, held=())))
     with pytest.raises(ConfigError, match="no slot"):
-        trial.with_gap(dataclasses.replace(settings, slot=None), SlotConfig.gap)
+        with_gap(dataclasses.replace(settings, slot=None), SlotConfig.gap)

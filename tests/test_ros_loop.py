@@ -32,6 +32,7 @@ from pred_ros.reroute_faults import FAULTS
 from pred_ros.reroute_record import PlanSeen, Record, Said
 from pred_ros.reroute_report import timeline
 from pred_ros.reroute_verdict import errors, goal_distances, judge
+from pred_ros.tracker_node import parse_fixtures
 
 ROOT = Path(__file__).parents[1]
 S = 1_000_000_000  # [ns]
@@ -208,6 +209,20 @@ def test_the_goal_leads_through_the_gap_and_counts_as_success() -> None:
     record.truth = [(S, goal + [0.0, 0.0, 0.02])]
     # Both sides are 20 mm from the nearest point where it lies flat, a little less where it rises.
     assert goal_distances(record)[1][0] == pytest.approx(0.04, abs=0.001)
+
+
+def test_planner_and_tracker_know_the_gap_of_the_plant() -> None:
+    given = lambda *more: reroute.prepare(reroute._parser().parse_args(more))  # noqa: E731
+    plain, narrow = given(), given("plant.gap=0.016")
+    assert (plain["planner"]["gap"], narrow["planner"]["gap"]) == (0.024, 0.016)
+    # Posts 9 cm wide and 12 mm thick beside x = 0.45 m: middles half a gap and 45 mm from it.
+    wanted = {0.450 - 0.012 - 0.045, 0.450 + 0.012 + 0.045}, {0.450 - 0.008 - 0.045, 0.450 + 0.008 + 0.045}
+    for nodes, middles in zip((plain, narrow), wanted, strict=True):
+        boxes = parse_fixtures(nodes["tracker"]["fixtures"])
+        assert sorted(b.center[0] for b in boxes) == pytest.approx(sorted(middles))
+        assert all(b.half_size == pytest.approx((0.045, 0.006, 0.05)) for b in boxes)
+    assert given("planner.gap=0.02", "tracker.fixtures=''")["planner"]["gap"] == 0.02
+    assert given("tracker.fixtures=''")["tracker"]["fixtures"] == ""
 
 
 def test_success_must_last() -> None:

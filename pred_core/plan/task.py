@@ -99,3 +99,10 @@ def make_planner(
 def load_settings(path: str) -> PlannerConfig:
     """The settings of a YAML file; '' = the defaults. Raises: ConfigError."""
     return PlannerConfig() if not path else load_config(PlannerConfig, Path(path))
+
+
+def with_gap(settings: PlannerConfig, gap: float) -> PlannerConfig:
+    """The settings with another gap [m] of their slot. Raises: ConfigError if they have no slot."""
+    if settings.slot is None:
+        raise ConfigError("the planner's settings have no slot", next_step="Use config/plan/slot.yaml")
+    return dataclasses.replace(settings, slot=dataclasses.replace(settings.slot, gap=gap))
