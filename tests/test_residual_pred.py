@@ -8,17 +8,17 @@ import pytest
 import torch
 from residual_case import PERIOD, Falling, line_body, random_state, still_grip
 
-from pred_core.dynamics import Dynamics
+from pred_core.dynamics import Dynamics, corrected
 from pred_core.errors import DivergenceError, InputError
-from pred_core.pred import FRAME, PReD, with_residual
+from pred_core.pred import COUNT, FRAME, PAST_POSITION, PAST_VELOCITY, WINDOW, PReD, with_residual
 from pred_core.residual import ResidualConfig, build_network
 from pred_core.types import Grip, State, stack_states
 
 SMALL = ResidualConfig(feature=16, hidden=16, embedding=16, feedforward=32, encoder_feedforward=32, encoder_layers=2)
 
 
-def model(seed: int = 0, untrained: bool = False) -> PReD:
-    network = build_network(SMALL, seed)
+def model(seed: int = 0, untrained: bool = False, config: ResidualConfig = SMALL) -> PReD:
+    network = build_network(config, seed)
     generator = torch.Generator().manual_seed(seed)
     if not untrained:
         with torch.no_grad():
@@ -95,6 +95,43 @@ def test_network_frame_turns_inputs_and_outputs() -> None:
         seen, other = pred.step(seen, still_grip()), pred.step(other, still_grip())
     assert torch.allclose(seen.position, other.position @ half_turn, atol=1e-5)
     assert not torch.allclose(seen.position, pred.rollout(plain, still_grip(3))[-1], atol=1e-5)
+
+
+def test_a_correction_is_no_motion_to_the_network() -> None:
+    """All measured 5 cm aside, which a network that sees no places cannot know: its residual is what it was. With the
+    positions replaced and the frame before left where it was, it would see a jump of 2.5 m/s."""
+    pred = model(config=dataclasses.replace(SMALL, coordinates="centered"))
+    state = pred.start(random_state(torch.Generator().manual_seed(4), held_first=False), still_grip())
+    for _ in range(3):
+        state = pred.step(state, still_grip())
+    aside = state.position + torch.tensor([0.05, 0.0, 0.0])
+    with torch.no_grad():
+        wanted = pred.advance(state, still_grip()).residual
+        got = pred.advance(corrected(pred, state, aside, state.velocity), still_grip()).residual
+        jumped = pred.advance(state.replace(position=aside), still_grip()).residual
+    assert torch.allclose(got, wanted, atol=1e-5)  # float32 of places over a period of 0.02 s
+    assert (jumped - wanted).abs().max() > 1e-2
+
+
+def test_a_correction_of_velocity_and_a_base_with_memory() -> None:
+    """Both parts of the frame before move along, and the base makes its own memory anew from the corrected state."""
+
+    class Remembering(Falling):
+        def corrected(self, state: State, position: torch.Tensor, velocity: torch.Tensor) -> State:
+            memory = {**state.memory, "times": torch.tensor(1)}
+            return state.replace(position=position, velocity=velocity, memory=memory)
+
+    plain = model()
+    pred = PReD(Remembering(), plain.network, line_body())
+    state = pred.step(pred.start(random_state(torch.Generator().manual_seed(5), 2), still_grip(2)), still_grip(2))
+    shift = 0.01 * torch.randn(state.position.shape, generator=torch.Generator().manual_seed(6))
+    moved = corrected(pred, state, state.position + shift, state.velocity - 10.0 * shift)
+    assert torch.equal(moved.position, state.position + shift) and torch.equal(moved.held, state.held)
+    for now, before in (("position", PAST_POSITION), ("velocity", PAST_VELOCITY)):
+        difference = getattr(state, now) - state.memory[before]
+        assert torch.allclose(getattr(moved, now) - moved.memory[before], difference, atol=1e-6)
+    assert set(moved.memory) == {*state.memory, "base/times"}
+    assert all(moved.memory[k] is state.memory[k] for k in (WINDOW, COUNT))
 
 
 def test_bad_states_are_refused() -> None:
