@@ -23,6 +23,9 @@ from pred_core.errors import DatasetError
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
+MOST_LEFT_OUT = 0.2  # of the episodes
+LATEST = 0.8  # share of the time after which no further round begins; the errors and the report take the rest
+
 
 def diagnose(
     episodes: Sequence[Episode],
@@ -81,10 +84,6 @@ def moved_markers(episodes: Sequence[Episode]) -> list[str]:
     limits = GateLimits()
     found = [q.name for q in examine_all(lambda: episodes) if q.stretch_frames > 0 or q.slip_max > limits.slip]
     return found if len(found) <= MOST_LEFT_OUT * len(episodes) else []
-
-
-MOST_LEFT_OUT = 0.2  # of the episodes
-LATEST = 0.8  # share of the time after which no further round begins; the errors and the report take the rest
 
 
 def _check(
