@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
+from bench_modules import loaded_modules
 from report_cases import PERIOD, drag, recorded, rope
 from torch import Tensor
 
@@ -23,6 +25,7 @@ from pred_core.diagnose.guard_shares import Model, cross_fitted, shares
 from pred_core.diagnose.report_network import read_network
 from pred_core.effects import find_effect
 from pred_core.errors import ConfigError, DatasetError, InputError, TwinError
+from pred_core.evaluate.report import write_json
 from pred_core.pred import load_base
 from pred_core.residual import Motion, ResidualConfig, ResidualNetwork, build_network
 from pred_core.residual.network import Buffer
@@ -183,13 +186,35 @@ def test_commands_ask_and_tell(
     assert "no network" in capsys.readouterr().err
 
 
-def test_errors_with_and_without_a_network_are_read_strictly(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def two_by_two() -> Iterator[ModuleType]:
+    for modules in loaded_modules(("measured_cables", "network_2x2")):
+        yield modules["network_2x2"]
+
+
+def test_the_table_of_base_and_extended_by_hand(two_by_two: ModuleType) -> None:
+    """Base 4, 6, 8 mm, with network 3, 6, 3: mean 6 and 4, the network takes 2 away, better in 2 of 3; extended 1, 1, 1
+    with network 2, 1, 1: it adds a third, better in none. The extension takes 5 away, and 8/3 beside a network.
+    """
+    values = {"base": (4, 6, 8), "base + network": (3, 6, 3), "extended": (1, 1, 1), "extended + network": (2, 1, 1)}
+    lines = two_by_two.markdown("test", {k: np.array(v, dtype=float) for k, v in values.items()})
+    cells = [[c.strip() for c in line.split("|")[1:-1]] for line in lines if line]
+    assert cells[0][0] == "test, 3 episodes [mm]"
+    base, extended, takes = cells[2:]
+    assert base[1].startswith("6.00 [4.00, 8.00] / 6.00") and base[2].startswith("4.00 [3.00, 6.00] / 3.00")
+    assert base[3].startswith("2.00 [0.00, 5.00]") and base[3].endswith("2 of 3")
+    assert extended[1].startswith("1.00 [1.00, 1.00]") and extended[3].startswith("-0.33 [-1.00, 0.00], 0 of 3")
+    assert takes[1].startswith("5.00 [3.00, 7.00], 3 of 3") and takes[2].startswith("2.67 [1.00, 5.00], 3 of 3")
+
+
+def test_errors_with_and_without_a_network_are_read_strictly(two_by_two: ModuleType, tmp_path: Path) -> None:
+    """What the benchmark writes is what the report reads; a cell that is missing is named."""
     path = tmp_path / "network.json"
-    cell = {"mean": 2.0, "low": 1.0, "high": 3.0}
-    table = {"test": dict.fromkeys(("base", "base + network", "extended", "extended + network"), cell)}
-    path.write_text(json.dumps(table))
-    assert read_network(path) == table
-    del table["test"]["extended"]
-    path.write_text(json.dumps(table))
+    cells = ("base", "base + network", "extended", "extended + network")
+    table = {"ood": {c: two_by_two.summary(np.array([1.0, 3.0])) for c in cells}}
+    write_json(path, table)
+    assert read_network(path) == table and table["ood"]["base"] == {"mean": 2.0, "low": 1.0, "high": 3.0}
+    del table["ood"]["extended"]
+    write_json(path, table)
     with pytest.raises(ConfigError, match="extended"):
         read_network(path)
