@@ -31,7 +31,7 @@ from pred_core.residual import Motion, ResidualConfig, ResidualNetwork, build_ne
 from pred_core.residual.network import Buffer
 from pred_core.train import Trainer, TrainingConfig, align
 from pred_core.twin import Twin
-from pred_core.types import Episode
+from pred_core.types import Episode, ObjectInfo
 
 SMALL = ResidualConfig(
     feature=16, encoder_layers=1, hidden=16, embedding=16, temporal_layers=1, cap=0.3, feedforward=16
@@ -184,6 +184,77 @@ def test_commands_ask_and_tell(
     assert again["reopened"][0] == "drag" and f"pred diagnose {data} --twin {out}" in printed
     assert main(["diagnose", str(data), "--twin", str(plain), "--guard", "--out", str(tmp_path / "none")]) == 2
     assert "no network" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def questioned(twin: Twin, episodes: list[Episode], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`twin` with a network in it, and four episodes of `data`."""
+    root = tmp_path_factory.mktemp("guard")
+    generator = torch.Generator().manual_seed(0)
+    network = build_network(SMALL, 0)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter += 0.2 * torch.randn(parameter.shape, generator=generator)
+    twin.replace(residual=network.weights()).save(root / "twin")
+    for e in episodes[:4]:
+        write_episode(root / "data" / f"{e.name}.mcap", e)
+    return root
+
+
+def listed(root: Path, split: str = "train") -> Path:
+    """The data set of `questioned`, all episodes with this split."""
+    names = sorted(p.name for p in (root / "data").glob("*.mcap"))
+    entries = [EpisodeEntry(name, split, n) for n, name in enumerate(names)]
+    info = ObjectInfo("rope", "line")
+    write_dataset(root / "data", object=info, rate=1.0 / PERIOD, entries=entries, held={0: 0})
+    return root / "data"
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ("--reference", "before"),
+        ("--network", "errors.json"),
+        ("--causes", "2"),
+        ("--no-settle",),
+        ("--reference", "before", "--network", "errors.json", "--seconds", "60"),
+    ],
+)
+def test_guard_refuses_options_it_would_not_heed(
+    questioned: Path, more: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["diagnose", str(listed(questioned)), "--twin", str(questioned / "twin"), "--out", str(tmp_path / "o")]
+    assert main([*command, "--guard", *more]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "--guard only asks about the twin's network" in line and " ".join(more) in line
+    assert not (tmp_path / "o").exists()
+
+
+def test_guard_checks_the_tracks_as_the_diagnosis_does(
+    questioned: Path, twin: Twin, episodes: list[Episode], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An episode with a particle that is never seen, one with a particle the twin lacks, and none to ask."""
+    data, out = listed(questioned), tmp_path / "out"
+    command = ["diagnose", str(data), "--twin", str(questioned / "twin"), "--out", str(out), "--guard"]
+    bag = data / f"{episodes[0].name}.mcap"
+    whole, tracks = bag.read_bytes(), episodes[0].tracks
+    hidden = tracks.visible.copy()
+    hidden[:, 5] = False
+    foreign = tracks.id.copy()
+    foreign[-1] = 77
+    for changed, words in (
+        (dataclasses.replace(tracks, visible=hidden), "never measured in this episode; got id 5"),
+        (dataclasses.replace(tracks, id=foreign), "particles that the twin lacks; got id 77"),
+    ):
+        write_episode(bag, dataclasses.replace(episodes[0], tracks=changed))
+        assert main(command) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert words in line
+    bag.write_bytes(whole)
+    listed(questioned, "ood")
+    assert main(command) == 2
+    assert "nothing to question a network on" in capsys.readouterr().err
+    assert not out.exists()
 
 
 @pytest.fixture(scope="module")

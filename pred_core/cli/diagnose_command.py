@@ -14,12 +14,14 @@ from pred_core.cli.checks import warn_of_another_object
 from pred_core.cli.network_guard import question, question_or_say
 from pred_core.cli.settings import add_settings, given_settings, read_settings
 from pred_core.diagnose.config import DiagnoseConfig
+from pred_core.diagnose.fits import check_tracks
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.motion_file import write_motion
 from pred_core.diagnose.report import write_report
 from pred_core.diagnose.report_network import read_network
 from pred_core.diagnose.result import Diagnosis
 from pred_core.diagnose.run import diagnose
+from pred_core.errors import ConfigError, DatasetError
 from pred_core.evaluate.report import write_json
 from pred_core.twin import Twin
 from pred_core.types import Episode
@@ -36,7 +38,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="data set of the same object without the effect: the change is diagnosed")
     parser.add_argument("--out", type=Path, required=True, help="output folder; an interrupted run goes on there")
     parser.add_argument("--guard", action="store_true",
-                        help="only ask whether the twin's network hides a cause: guard.json and guard.html")
+                        help="only ask whether the twin's network hides a cause: guard.json and guard.html; no other "
+                        "option goes with it")
     parser.add_argument("--network", type=Path, default=None, metavar="FILE",
                         help="errors with and without a network to show in the report (benchmarks/network_2x2.py)")
     add_settings(parser, DiagnoseConfig)
@@ -45,12 +48,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Exit code 0 whatever the outcome; raises PredError for bad input."""
     begin = time.monotonic()
+    if args.guard:
+        _check_guard_alone(args)
     config: DiagnoseConfig = read_settings(args, DiagnoseConfig, "pred diagnose")
     dataset = load_dataset(args.dataset)
     twin = Twin.load(args.twin)
     warn_of_another_object(twin, dataset, str(args.twin))
     if args.guard:
-        lines = question(twin, _unseen(dataset), args.out, args.dataset, args.twin)[1]
+        asked = _unseen(dataset)
+        check_tracks(asked, (), twin)
+        lines = question(twin, asked, args.out, args.dataset, args.twin)[1]
         print("\n".join([*lines, str(args.out / "guard.html")]))
         return 0
     network = None if args.network is None else read_network(args.network)
@@ -76,9 +83,28 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _check_guard_alone(args: argparse.Namespace) -> None:
+    """Raise ConfigError for options that the question about the network would not heed."""
+    more = _words(args)[len(_needed(args)) :]
+    if more:
+        raise ConfigError(
+            "--guard only asks about the twin's network",
+            got=shlex.join(more),
+            allowed="DATASET, --twin and --out",
+            next_step="Leave out --guard to diagnose, or the other options to ask",
+        )
+
+
 def _unseen(dataset: Dataset) -> list[Episode]:
-    """Episodes that a network is questioned on: those of the motions it is for."""
-    return [e for e in dataset.episodes() if e.split != "ood"]
+    """Episodes that a network is questioned on: those of the motions it is for. Raises: DatasetError without any."""
+    found = [e for e in dataset.episodes() if e.split != "ood"]
+    if not found:
+        raise DatasetError(
+            f"{dataset.root}: nothing to question a network on",
+            got="episodes with split 'ood' only",
+            allowed="train or test episodes of 2 recordings or more",
+        )
+    return found
 
 
 def _write_next_motion(path: Path, answer: Diagnosis) -> None:
@@ -99,8 +125,12 @@ def _header(dataset: Dataset, reference: Dataset | None, twin: Twin, config: Dia
     return {"data": hashes, "facts": facts, **asked}
 
 
+def _needed(args: argparse.Namespace) -> list[str]:
+    return ["diagnose", str(args.dataset), "--twin", str(args.twin), "--out", str(args.out)]
+
+
 def _words(args: argparse.Namespace) -> list[str]:
-    words = ["diagnose", str(args.dataset), "--twin", str(args.twin), "--out", str(args.out)]
+    words = _needed(args)
     if args.reference is not None:
         words += ["--reference", str(args.reference)]
     if args.network is not None:
