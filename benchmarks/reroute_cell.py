@@ -32,6 +32,7 @@ class DrivenCell:
         """pictures: render the cell's cameras at their own rates."""
         self.station = Station(cell, pictures)
         self.guard, self._follower = Guard(GUARD), Follower(GUARD, LIFETIME)
+        self._unreachable: str | None = None
 
     def begin(self, seed: int, way: Segment | None = None) -> Moment:
         """A start pose, then a scripted way if there is one; the guard is armed where the arm stands then."""
@@ -45,7 +46,7 @@ class DrivenCell:
     @property
     def fault(self) -> str | None:
         """Why the arm stopped for good; None while it follows."""
-        return self.guard.line if self.guard.mode is Mode.FAULT else None
+        return self.guard.line if self.guard.mode is Mode.FAULT else self._unreachable
 
     def follow(self, plan: Plan) -> str | None:
         """Hand a plan to the arm. Returns None, or why it was refused."""
@@ -60,10 +61,14 @@ class DrivenCell:
         return None
 
     def advance(self, seconds: float) -> list[Moment]:
-        """Let time go on for `seconds` [s], a whole number of set-points."""
+        """Let time go on for `seconds` [s], a whole number of set-points; to a pose out of the arm's reach, a fault."""
         moments: list[Moment] = []
         for _ in range(round(seconds / (EVERY * TICK))):
-            moments += self.station.advance(self._setpoint(), EVERY)
+            try:
+                moments += self.station.advance(self._setpoint(), EVERY)
+            except InputError as error:  # as in the live cell, the arm's servo stops for good
+                self._unreachable = str(error)
+                break
             pose = moments[-1].truth.gripper
             self.guard.measured(pose.position, tuple(pose.rotation.tolist()))
         return moments

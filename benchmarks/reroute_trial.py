@@ -56,9 +56,14 @@ def open_cell(config: TrialConfig, twin: Twin) -> Cell:
 
 
 def run_trial(
-    twin: Twin, settings: PlannerConfig, config: TrialConfig, seed: int, goals: Path | None = None
+    twin: Twin,
+    settings: PlannerConfig,
+    config: TrialConfig,
+    seed: int,
+    goals: Path | None = None,
+    eyes: Eyes | None = None,
 ) -> dict[str, Any]:
-    """What happened, ready for JSON. goals: a folder that keeps the goal of each seed."""
+    """What happened, ready for JSON. goals: a folder that keeps the goal of each seed; eyes: instead of config's."""
     begun = time.process_time()
     check_twin(twin)
     with open_cell(config, twin) as cell:
@@ -67,7 +72,8 @@ def run_trial(
         driven = DrivenCell(cell, cameras)
         slotted = with_gap(settings, config.gap)
         dynamics = planning_dynamics(twin, scene_with_slot(twin.scene, slotted))
-        eyes: Eyes = CameraEyes(twin, cell, dynamics) if cameras else TrueEyes(twin)
+        if eyes is None:
+            eyes = CameraEyes(twin, cell, dynamics) if cameras else TrueEyes(twin)
 
         def make(points: Array, clock: Callable[[], float]) -> Planner:
             return make_planner(twin, points, slotted, seed, dynamics=dynamics, clock=clock)
@@ -136,7 +142,9 @@ class Trial:
                 return "time is up"
             if not success:
                 self._replan()
-            self._eyes.see(self._driven.advance(self._config.replan))
+            moments = self._driven.advance(self._config.replan)
+            if moments:
+                self._eyes.see(moments)
 
     def _replan(self) -> None:
         seen = self._eyes.observe()

@@ -94,6 +94,27 @@ def test_a_plan_the_arm_does_not_follow_is_given_up(bench, twin, settings, tmp_p
     assert counts["plans"] == len(result["replans"]) and counts["plans"] + counts["moving"] == 5
 
 
+def test_out_of_the_arms_reach_ends_a_trial(bench, twin, settings, tmp_path: Path, monkeypatch) -> None:
+    """A failure that counts, as the arm's fault in the live cell; no trial that is left out."""
+    goal_file(bench, tmp_path, 3)
+    cell = bench["reroute_cell"]
+    far = cell.ToolPose(np.array([0.8, 0.3, 0.3]), np.array([0.0, 1.0, 0.0, 0.0]))  # 0.9 m from the base
+    begin: list[Any] = []
+
+    def setpoint(self: Any) -> Any:
+        here = self.station.cell.reference
+        begin.append(here)
+        share = min(1.0, 0.02 * len(begin))  # 75 Hz: there within 0.7 s, out of reach before
+        return cell.ToolPose((1.0 - share) * begin[0].position + share * far.position, here.rotation)
+
+    monkeypatch.setattr(cell.DrivenCell, "_setpoint", setpoint)
+    monkeypatch.setattr(cell.Guard, "measured", lambda *_: None)  # it would see that its set-point is not followed
+    trial = bench["reroute_trial"]
+    result = trial.run_trial(twin, settings, trial.TrialConfig(limit=3.0), 3, tmp_path)
+    assert result["outcome"].startswith("arm stopped: ") and "out of the arm's reach" in result["outcome"]
+    assert not result["success"] and 0.2 <= result["chamfer"][-1][0] <= 1.2
+
+
 def test_what_is_there_is_kept(bench, twin: Twin, tmp_path: Path, monkeypatch, capsys) -> None:
     reroute = bench["reroute"]
     for name in ("spring-mass", "pred"):
