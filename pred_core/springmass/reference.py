@@ -21,6 +21,7 @@ from pred_core.springmass.arrays import bend_rows, chains, mass_of_worlds
 from pred_core.springmass.collision import candidate_pairs, connected_within
 from pred_core.springmass.parameters import effects_of, extensions_per_world
 from pred_core.springmass.reference_bending import BendMemory, bend_forces
+from pred_core.springmass.source_contact import WAY_OUT
 from pred_core.twin import Extension
 from pred_core.types import Body, Box, Fixture, Grip, Physics, Scene, Sphere, State
 
@@ -224,7 +225,7 @@ class Reference:
 
 
 def press(gap: Tensor, normal: Tensor, moving: Tensor, mu: Tensor, v: Tensor, h: float) -> tuple[Tensor, Tensor]:
-    """Velocity after a non-penetrating contact with Coulomb friction, and the way out of the surface [m]."""
+    """Velocity after a non-penetrating contact with Coulomb friction, and the way out of the surface [m], a step of it."""
     relative = v - moving
     vn = (relative * normal).sum(-1)
     cut = (-gap.clamp_min(0.0) / h - vn).clamp_min(0.0)
@@ -232,7 +233,7 @@ def press(gap: Tensor, normal: Tensor, moving: Tensor, mu: Tensor, v: Tensor, h:
     slide = (tangential.square().sum(-1) + TINY).sqrt()
     lost = (mu * cut / slide).clamp_max(1.0)
     v = v + cut[..., None] * normal - lost[..., None] * tangential
-    return v, (-gap).clamp_min(0.0)[..., None] * normal
+    return v, (-gap).clamp(0.0, WAY_OUT * h)[..., None] * normal
 
 
 def fixture_gap(fixture: Fixture, x: Tensor) -> tuple[Tensor, Tensor]:

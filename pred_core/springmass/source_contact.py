@@ -1,12 +1,16 @@
 """Contact, self-collision, particles and grippers as C++ text; see `source.py`."""
 
+# Speed [m/s] at which a particle that begins inside a surface leaves it. All at once, the damping of a bend would take
+# the way out for a motion within one substep and throw the neighbours up, by EI tau / l^2 over their mass a radian.
+WAY_OUT = 0.1
+
 # Contact: the velocity after the substep may not carry the particle through the surface. Where it would,
 # the normal velocity is cut to what reaches the surface, and Coulomb friction takes at most mu times that cut
 # from the sliding velocity. Convex shapes cannot be tunnelled: their signed distance is a convex function.
 CONTACT = r"""
   auto press = [&](Lane gap, Lane nx, Lane ny, Lane nz, Lane sx, Lane sy, Lane sz, Lane mu,
                    Lane& vx, Lane& vy, Lane& vz) -> Lane {
-    // gap [m], outward normal n, surface velocity s; returns how far the particle is inside.
+    // gap [m], outward normal n, surface velocity s; returns how far a particle inside moves out in this substep.
     const Lane rx = vx - sx, ry = vy - sy, rz = vz - sz;
     const Lane vn = rx * nx + ry * ny + rz * nz;
     const Lane cut = lane_max(-lane_max(gap, zero) * (1.0f / h) - vn, zero);
@@ -14,7 +18,7 @@ CONTACT = r"""
     const Lane slide = lane_sqrt(tx * tx + ty * ty + tz * tz + tiny);
     const Lane keep = lane_max(one - mu * cut / slide, zero) - one;
     vx += cut * nx + keep * tx; vy += cut * ny + keep * ty; vz += cut * nz + keep * tz;
-    return lane_max(-gap, zero);
+    return lane_min(lane_max(-gap, zero), Lane(@WAY_OUT@f * h));
   };
   auto fixture_gap = [&](int f, Lane x, Lane y, Lane z, Lane& nx, Lane& ny, Lane& nz) -> Lane {
     const float* d = fixture_data + 16 * f;
@@ -52,7 +56,7 @@ CONTACT = r"""
     nz = d[8] * mx + d[11] * my + d[14] * mz;
     return outside + inside;
   };
-"""
+""".replace("@WAY_OUT@", str(WAY_OUT))
 
 # Approaching pairs closer than two radii exchange the impulse that stops their approach.
 SELF_COLLISION = r"""
