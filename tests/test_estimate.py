@@ -186,6 +186,46 @@ def test_tracks_older_than_the_history_or_newer_than_the_state(dynamics) -> None
         followed.correct(tracks(truth[30], 31))
 
 
+def test_a_track_that_is_not_finite_is_refused_and_changes_nothing(dynamics) -> None:
+    """It is not measured, or it is an error of the sender: never one of the wrong tracks that mean `lost`."""
+    truth = true_run(dynamics, 4)
+    refused, plain = started(dynamics), started(dynamics)
+    for k in range(1, 5):
+        for followed in (refused, plain):
+            followed.step(k * PERIOD, grip(k))
+        if k % EVERY:
+            continue
+        for value in (np.nan, np.inf):
+            seen = tracks(truth[k], k)
+            seen.position[17, 1] = value
+            with pytest.raises(InputError, match="track of particle 17 is not finite.*at confidence 0.99"):
+                refused.correct(seen)
+        for followed in (refused, plain):
+            followed.correct(tracks(truth[k], k, np.delete(np.arange(COUNT), 17)))
+    assert torch.equal(refused.state.position, plain.state.position)
+    assert refused.tally == plain.tally and refused.tally.rejected == 0
+    hidden = tracks(truth[4], 4)
+    hidden.position[17], hidden.confidence[17] = np.nan, 0.0  # as on the wire: not measured
+    assert 17 not in refused.correct(hidden).index
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"index": np.append(np.arange(COUNT - 1), COUNT)}, "each of 0 to 29 once"),
+        ({"index": np.append(np.arange(COUNT - 1), 3)}, "29 different ones"),
+        ({"index": np.arange(COUNT - 1)}, r"index \(29,\), position \(30, 3\)"),
+        ({"confidence": np.append(np.ones(COUNT - 1), np.nan)}, "confidence of particle 29; got nan"),
+        ({"confidence": np.append(np.ones(COUNT - 1), 1.5)}, "confidence of particle 29; got 1.5; allowed: 0 to 1"),
+    ],
+)
+def test_what_cannot_be_tracks_of_the_body_is_refused(dynamics, change: dict[str, np.ndarray], words: str) -> None:
+    followed = started(dynamics)
+    state = followed.step(PERIOD, grip(1))
+    with pytest.raises(InputError, match=words):
+        followed.correct(dataclasses.replace(tracks(state, 1), **change))
+
+
 def test_a_correction_does_not_stretch_the_rope(dynamics) -> None:
     """Tracks that lie 2 cm aside, with 2 mm of noise: springs keep their length, and their ends do not part.
 

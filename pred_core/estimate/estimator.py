@@ -69,7 +69,8 @@ class Estimator:
     def correct(self, seen: Measurement) -> Outcome:
         """Correct the state of the measurement's time, and simulate on to the newest with the same grips.
 
-        Raises: InputError if the measurement is newer than the state or older than the last one; DivergenceError.
+        Raises: InputError if the measurement is newer than the state or older than the last one, or if a track is not
+        finite (`Measurement`; the state stays what it was); DivergenceError.
         """
         if seen.stamp > self.stamp + SAME or seen.stamp < self._corrected:
             raise InputError(

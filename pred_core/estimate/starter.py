@@ -44,7 +44,8 @@ class Starter:
         self._lengths = Lengths(body, np.ones(body.count))
 
     def add(self, seen: Measurement) -> None:
-        """Tracks newer than those before."""
+        """Tracks newer than those before. Raises: InputError as `Measurement.check` does; nothing is kept then."""
+        seen.check(self._body.count)
         good = seen.confidence > self._config.least_confidence
         self._seen.append(Measurement(seen.stamp, seen.index[good], seen.position[good], seen.confidence[good]))
         while len(self._seen) > 2 and (seen.stamp - self._seen[0].stamp) / NS > self._config.start_window:
