@@ -85,7 +85,7 @@ def judged(twin: Twin, id: str, coefficient: float, width: float, gain: Sequence
         intervals={knob.name: (coefficient - width / 2, coefficient + width / 2)},
         gain=np.array(gain, dtype=float),
         acts=np.ones(len(gain), dtype=bool),
-        extended=np.ones(len(gain)),
+        extended=10.0 - np.array(gain, dtype=float),
         z=np.array([knob.coordinate(coefficient)]),
     )
 

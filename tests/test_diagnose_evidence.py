@@ -95,6 +95,7 @@ def nested(twin: Twin, share: float) -> tuple[Judged, Judged]:
         plain,
         trial=many,
         gain=rich,
+        extended=10.0 - rich,
         values=dict.fromkeys(names, 1.0),
         null=dict.fromkeys(names, 0.0),
         intervals=dict.fromkeys(names, (0.9, 1.1)),

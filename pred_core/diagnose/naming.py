@@ -14,7 +14,7 @@ LEFT = 0.25  # of the floor: an excess that is called unknown if nothing explain
 FEWEST = 10  # episodes for inference; fewer are exploratory
 SLIGHT = 0.05  # of the mean gain: an episode that loses less is not worse
 EXPLORATORY = 0.5  # share of the excess a cause must close to be named from fewer
-BETTER = 1.1  # times the gain of a simpler law that one with more parameters needs to be its rival
+BETTER = 0.1  # of the gain of a simpler law that one with more parameters must save beyond it to be its rival
 STANDING = 0.05  # of the floor: a gain below is not worth a name, whatever its significance
 
 
@@ -45,17 +45,22 @@ def choose(
     accepted = [row for row in rows if not row[2]]
     if not accepted:
         return None, rows
-    best = max(accepted, key=lambda row: row[0].mean)[0]
+    best = min(accepted, key=lambda row: row[0].left)[0]
     chosen = simplest([row[0] for row in accepted], best)
     limit = set_limit(len(chosen.gain))
     near = [
         o
         for o, z in rivals([r[0] for r in accepted], chosen)
-        if o is not chosen and z < limit and not (o.parameters > chosen.parameters and o.mean < BETTER * chosen.mean)
+        if o is not chosen and z < limit and not (o.parameters > chosen.parameters and not much_better(o, chosen))
     ]
     q = next(row[1] for row in accepted if row[0] is chosen)
     closed = share_closed(chosen, progress, excess, floor)
     return Named(chosen, q, tuple(o.trial.id for o in near), closed, len(progress.rounds)), rows
+
+
+def much_better(one: Judged, simpler: Judged) -> bool:
+    """Whether a candidate with more parameters saves so much more that a simpler law does not replace it."""
+    return simpler.left - one.left >= BETTER * simpler.mean
 
 
 def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress) -> str:

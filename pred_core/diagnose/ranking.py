@@ -70,7 +70,7 @@ def _finalists(first: Round, chosen: Named | None, sure: float) -> list[Ranked]:
     whole = float(first.base.mean())
     excess = max(whole - first.floor, 0.05 * whole, 1e-9)
     judged = [j for j, _, _ in first.judged]
-    best = chosen.judged if chosen else max(judged, key=lambda j: j.mean)
+    best = chosen.judged if chosen else min(judged, key=lambda j: j.left)
     weight = {j.trial.id: math.exp(-SHARP * max(z, 0.0)) for j, z in rivals(judged, best)}
     p = {j.trial.id: (q, why) for j, q, why in first.judged}
     allowed = {k: w for k, w in weight.items() if not p[k][1] or (chosen is not None and k == best.trial.id)}

@@ -85,6 +85,7 @@ class Diagnosis:
     twin: Twin  # carries what was named
     seconds: float
     seed: int
+    more: bool = False  # beside what was named something is left that no candidate explains
     explained: float | None = None  # share of the motion in windows of held-out episodes; None: it hardly moves
     settings: Mapping[str, Any] = field(default_factory=dict)  # of the run
 
@@ -95,6 +96,7 @@ class Diagnosis:
             "outcome": self.outcome,
             "sentence": self.sentence,
             "exploratory": self.exploratory,
+            "unexplained_rest": self.more,
             "causes": [_cause(c) for c in self.causes],
             "group": next(([c.id, *c.group] for c in self.causes if c.group), []),
             "ranking": [

@@ -24,8 +24,9 @@ from pred_core.types import Grip, State
 FARTHEST = 0.5  # [m] a coordinate's error counts with at most; also where the simulation is not finite
 NEAR = 0.01  # [m]
 MOST_WORLDS = 1536  # in one kernel call
-LADDER = (1.0, 1.15, 1.35, 1.6, 2.0, 2.5, 3.2, 4.0)  # times the substeps the twin needs: what candidates get
-MOST_FACTOR = LADDER[-1]
+LADDER = (1.0, 1.15, 1.35, 1.6, 2.0, 2.5, 3.2, 4.0, 6.0, 9.0, 12.0)  # times the twin's substeps: what candidates get
+MOST_FACTOR = 4.0  # a search goes no farther than that
+MOST_LOSS = LADDER[-1]  # nor than that where the candidate is a loss in bending, which acts plainly only there
 
 
 @dataclass(frozen=True)

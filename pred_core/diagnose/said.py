@@ -75,7 +75,8 @@ def sentence(d: Diagnosis) -> str:
     what = "; and ".join(called(c) for c in d.causes)
     group = tuple(g for c in d.causes for g in c.group)
     unsure = f" (or {', '.join(NAMES.get(g, g) for g in group)}: these data do not tell)" if group else ""
-    return f"{label}Your simulation lacks {what}{unsure}; with it {numbers}."
+    more = " Something else is left that no candidate explains." if d.more else ""
+    return f"{label}Your simulation lacks {what}{unsure}; with it {numbers}.{more}"
 
 
 def _no_base(d: Diagnosis) -> bool:

@@ -16,6 +16,8 @@ from pred_core.twin import Extension
 from pred_core.types import Array
 
 SECANT = 0.7  # typical changes of the switch, over which a first slope is taken
+AHEAD = (1.5, 3.0, 6.0, 10.0)  # [typical changes] how far a start is followed along its direction
+NOWHERE = 1e-6  # [typical changes] length of a start that has no direction
 SCANNED = 16  # windows in which places are tried, those with the largest loss: one block of worlds
 
 
@@ -82,7 +84,42 @@ def starts(target: Target, trial: Trial, count: int, rng: np.random.Generator) -
             continue
         found.append(Start(z, promise))
     found.sort(key=lambda s: -s.promise)
+    farther = [_along(target, trial, s, share) for s in found[: 1 if scanning else None]]
+    found = sorted([*(s for s in farther if s is not None), *found], key=lambda s: -s.promise)
     return found or [Start(null, 0.0)]
+
+
+def _along(target: Target, trial: Trial, start: Start, share: float) -> Start | None:
+    """A better point farther along the direction of a start, None if there is none: where the loss bends, a straight
+    line promises little, and a search that begins at a weak cause can end before it comes to a strong one.
+
+    It is looked for in some of the windows; what it saves is measured in all of them.
+    """
+    space, switches = trial.space, list(trial.amplitudes)
+    lower, upper = (np.array(b)[switches] for b in space.bounds())
+    off = start.z.copy()
+    off[switches] = space.start()[switches]
+    length = float(np.linalg.norm(start.z - off))
+    if length < NOWHERE:
+        return None
+    usual = target.roller.usual()
+    count = target.roller.sample.windows.count
+    few = target.some(np.linspace(0, count - 1, SCANNED).astype(np.int64)) if count > SCANNED else target
+    best, least = start.z, float(few.losses(space, [start.z]).mean())
+    for distance in (d for d in AHEAD if d > length):
+        point = off + distance / length * (start.z - off)
+        point[switches] = np.clip(point[switches], lower, upper)
+        if np.array_equal(point, best) or target.roller.demand(space.candidate(point)) > trial.most * usual:
+            break
+        loss = float(few.losses(space, [point]).mean())
+        if loss < least:
+            best, least = point, loss
+        elif best is not start.z:
+            break  # it has passed the valley
+    if best is start.z:
+        return None
+    before, after = target.losses(space, [off, best]).mean(axis=1)
+    return Start(best, max(share * float(before - after), 0.0))
 
 
 def _scanned_values(extension: Extension) -> dict[str, tuple[float, ...]]:

@@ -6,13 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pred_core.diagnose.roll import Roller
+from pred_core.diagnose.roll import MOST_FACTOR, MOST_LOSS, Roller
+from pred_core.effects import find_effect
 from pred_core.effects.effect import Effect, Parameter
 from pred_core.identify.space import SearchSpace, search_space
 from pred_core.twin import Extension, Twin
 from pred_core.types import Array
 
 # Effects that are measurement (corrected, not simulated) or too flexible to be a name: they would explain anything.
+LOSS = "internal loss"  # family
 NOT_A_NAME = ("bending_profile", "mass_profile", "rest_curvature")
 
 
@@ -29,6 +31,11 @@ class Trial:
     def id(self) -> str:
         """Name."""
         return "+".join(self.ids)
+
+    @property
+    def most(self) -> float:
+        """Times the twin's substeps that a search may need."""
+        return MOST_LOSS if any(find_effect(i).family == LOSS for i in self.ids) else MOST_FACTOR
 
 
 def make_trial(
