@@ -49,6 +49,26 @@ def test_a_shift_is_found_among_candidates_without_one(twin: Twin) -> None:
     assert p[3] < 0.005 and (np.delete(p, 3) > 0.05).all()
 
 
+def test_few_recordings_are_flipped_by_episodes(twin: Twin) -> None:
+    """Sixteen episodes of six recordings, in two of which nothing acts: signs of recordings cannot fall below
+    2^-4 = 0.06, whatever the gain; those of episodes can. With twelve recordings they are flipped together.
+    """
+    six, twelve = np.repeat(np.arange(6), [3, 3, 3, 3, 2, 2]), np.repeat(np.arange(12), 2)
+    rows = np.where(six < 4, 1.0, 0.0)[None] * np.linspace(0.9, 1.1, 16)
+    assert family_wise(gains(twin, rows), 0, six)[0] < 0.001
+    alike = np.where(twelve == 0, 5.0, np.where(twelve % 2, 0.2, -0.2))[None]  # one recording alone gains
+    assert family_wise(gains(twin, alike), 0, twelve)[0] > 0.2
+    assert family_wise(gains(twin, alike), 0)[0] < 0.15
+
+
+def test_names_go_to_what_leaves_least(twin: Twin) -> None:
+    """Each candidate is compared with its own null, so the larger gain can stand for the larger rest."""
+    flattered, right = gains(twin, np.array([[2.0, 2.1, 1.9, 2.0], [1.5, 1.6, 1.4, 1.5]]))
+    flattered = dataclasses.replace(flattered, extended=np.array([1.0, 1.1, 0.9, 1.0]))
+    right = dataclasses.replace(right, extended=np.array([0.8, 0.7, 0.8, 0.9]))
+    assert rivals([flattered, right], right)[0][0] is right and simplest([flattered, right], right) is right
+
+
 def test_episodes_that_fit_worse_are_told() -> None:
     """Losses have a scale of their own, so their logs are compared. On 8 against 8 episodes a factor of 3 over a
     scatter of 30 % is 5 standard errors; nothing is told of 2 episodes.
