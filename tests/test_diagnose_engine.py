@@ -27,6 +27,7 @@ from pred_core.diagnose.rounds import finish
 from pred_core.diagnose.run import diagnose, moved_markers
 from pred_core.diagnose.said import sentence
 from pred_core.diagnose.sample import Sample, make_sample
+from pred_core.diagnose.search import starts
 from pred_core.diagnose.skill import skill_of
 from pred_core.diagnose.trial import Trial, make_trial
 from pred_core.diagnose.weigh import weigh
@@ -88,6 +89,18 @@ def test_planted_drag_is_recovered(twin: Twin, dragged: list[Episode], reference
     assert space.values(result.z)["drag_linear.coefficient[0]"] == pytest.approx(1.5, rel=0.02)
     before = bench.fitted.losses(space, [space.start()])[0]
     assert (result.loss < 0.2 * before).all()  # 5.8 to noise, whose mean loss is about 0.35
+
+
+def test_a_search_for_a_strong_cause_begins_near_it(twin: Twin, reference: list[Episode]) -> None:
+    """Drag of 6 /s is 12 typical changes. A straight line from "off" goes three at most; followed while the loss falls
+    it comes to ten. What it promises there is what is saved there, and more than the line's end saves.
+    """
+    bench = bench_of(twin, recorded(twin, drag(coefficient=6.0), SPLITS, seed=0, frames=40), reference)
+    trial = drag_trial(bench)
+    first, second = starts(bench.fitted, trial, SMALL.places, np.random.default_rng(0))[:2]
+    assert first.z == pytest.approx([10.0]) and 0.0 < second.z[0] <= 3.0
+    losses = bench.fitted.losses(trial.space, [trial.space.start(), first.z, second.z]).mean(axis=1)
+    assert first.promise == pytest.approx(losses[0] - losses[1], rel=1e-6) and losses[1] < losses[2]
 
 
 def test_without_a_group_leaves_no_trace_of_it(twin: Twin, dragged: list[Episode], reference: list[Episode]) -> None:

@@ -225,7 +225,7 @@ class Reference:
 
 
 def press(gap: Tensor, normal: Tensor, moving: Tensor, mu: Tensor, v: Tensor, h: float) -> tuple[Tensor, Tensor]:
-    """Velocity after a non-penetrating contact with Coulomb friction, and a substep of the way out of the surface [m]."""
+    """Velocity after a non-penetrating contact with Coulomb friction, and what a substep takes of the way out [m]."""
     relative = v - moving
     vn = (relative * normal).sum(-1)
     cut = (-gap.clamp_min(0.0) / h - vn).clamp_min(0.0)
