@@ -138,7 +138,8 @@ def run_trials(args: argparse.Namespace) -> int:
 
 def trial_folder(work: Path, name: str, config: TrialConfig) -> Path:
     """Where the trials of a twin in one setting stand."""
-    return work / "trials" / f"{name}-{config.eyes}-gap{1e3 * config.gap:g}-cable{config.cable}"
+    replan = "" if config.replan == TrialConfig.replan else f"-replan{config.replan:g}"
+    return work / "trials" / f"{name}-{config.eyes}-gap{1e3 * config.gap:g}-cable{config.cable}{replan}"
 
 
 def about(twin: Path, settings: str, config: TrialConfig) -> dict[str, Any]:
@@ -160,8 +161,6 @@ def _trial(twin: Path, settings: str, config: TrialConfig, seed: int, path: Path
         return f"{name}: failed: {error}", False
     write_whole(path, result)
     return f"{name}: {result['outcome']} after {result['time']:.1f} s, {result['cpu_seconds']:.0f} s of computing", True
-
-
 
 
 if __name__ == "__main__":
