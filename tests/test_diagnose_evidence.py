@@ -69,6 +69,21 @@ def test_names_go_to_what_leaves_least(twin: Twin) -> None:
     assert rivals([flattered, right], right)[0][0] is right and simplest([flattered, right], right) is right
 
 
+def test_a_local_cause_is_told_from_off_and_not_from_another_place(twin: Twin) -> None:
+    """A pull of strength 1 [0.6, 1.4] here; in the reference the same law found 0.8 elsewhere. For drag, which acts
+    everywhere, 0.8 would be no change.
+    """
+    _, local = nested(twin, 0.5)
+    switch = local.trial.space.knobs[local.trial.amplitudes[0]].name
+    inside = {**local.intervals, switch: (0.6, 1.4)}
+    local = dataclasses.replace(local, null={**local.null, switch: 0.8}, intervals=inside)
+    assert local.excludes_null
+    assert not dataclasses.replace(local, intervals={**local.intervals, switch: (-0.1, 1.4)}).excludes_null
+    drag = judged(twin, "drag_linear", 1.0, 0.8, [1.0] * 10)
+    assert drag.excludes_null
+    assert not dataclasses.replace(drag, null=dict.fromkeys(drag.null, 0.8)).excludes_null
+
+
 def test_episodes_that_fit_worse_are_told() -> None:
     """Losses have a scale of their own, so their logs are compared. On 8 against 8 episodes a factor of 3 over a
     scatter of 30 % is 5 standard errors; nothing is told of 2 episodes.

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from pred_core.diagnose.trial import Trial
+from pred_core.diagnose.trial import Trial, scanned
+from pred_core.effects import find_effect
 from pred_core.types import Array
 
 FLIPS = 20_000
@@ -64,10 +65,20 @@ class Judged:
     @property
     def excludes_null(self) -> bool:
         """The interval of a switch leaves out its null value."""
+        return any(self.is_on(id) for id in self.trial.ids)
+
+    def is_on(self, id: str) -> bool:
+        """The interval of a switch of this effect leaves out its null; off, where the effect acts in a place: what the
+        reference has in another place, or has not, says nothing of how strong it is here.
+        """
+        local = bool(scanned(find_effect(id)))
         for n in self.trial.amplitudes:
             knob = self.trial.space.knobs[n]
+            if not knob.name.startswith(f"{id}."):
+                continue
+            null = knob.null if local else self.null[knob.name]
             low, high = self.intervals[knob.name]
-            if low > self.null[knob.name] or high < self.null[knob.name]:
+            if low > null or high < null:
                 return True
         return False
 

@@ -95,13 +95,3 @@ def share_closed(j: Judged, progress: Progress, excess: float, floor: float) -> 
         return 0.0
     standing = excess + floor
     return float(np.clip((standing - float(j.extended.mean())) / excess, 0.0, 1.0))
-
-
-def every_member(j: Judged) -> bool:
-    """Whether each effect of a pair has a switch whose interval leaves out its null."""
-    for id in j.trial.ids:
-        knobs = [j.trial.space.knobs[n].name for n in j.trial.amplitudes]
-        mine = [k for k in knobs if k.startswith(f"{id}.")]
-        if not any(j.intervals[k][0] > j.null[k] or j.intervals[k][1] < j.null[k] for k in mine):
-            return False
-    return True

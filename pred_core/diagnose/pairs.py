@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from pred_core.diagnose.evidence import Judged, family_wise
 from pred_core.diagnose.judge import Effects, Screened, Tell, judge
-from pred_core.diagnose.naming import LEFT, every_member, share_closed, why_not
+from pred_core.diagnose.naming import LEFT, share_closed, why_not
 from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.search import Start
 from pred_core.types import Array
@@ -57,6 +57,6 @@ def try_pairs(
         return None
     groups = bench.target.roller.sample.groups
     p = float(family_wise(tried, config.seed, groups)[[t is best for t in tried].index(True)])
-    if why_not(best, p, excess, floor, progress) or not every_member(best):
+    if why_not(best, p, excess, floor, progress) or not all(best.is_on(id) for id in best.trial.ids):
         return None
     return Named(best, p, (), share_closed(best, progress, excess, floor), number)
