@@ -64,9 +64,9 @@ class Progress:
         self.rounds.pop()
         self.bench = bench
 
-    def late(self) -> bool:
-        """Whether the time is used up."""
-        return time.monotonic() > self.deadline
+    def late(self, needs: float = 0.0) -> bool:
+        """Whether the time is used up, or would be after `needs` [s] more."""
+        return time.monotonic() + needs > self.deadline
 
 
 def _refitted(named: Named, later: Judged) -> Named:

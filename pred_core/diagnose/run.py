@@ -24,6 +24,7 @@ from pred_core.twin import Twin
 from pred_core.types import Episode
 
 MOST_LEFT_OUT = 0.2  # of the episodes
+SLOWER = 2.0  # times a round before; where one would be, the time it needs is counted before it begins
 LATEST = 0.8  # share of the time after which no further round begins; the errors and the report take the rest
 
 
@@ -64,12 +65,17 @@ def diagnose(
         why = "left out of fitting and judging, because a marker has moved on the object (`pred info`)"
         progress.notes.append(f"{why}: {', '.join(left_out)}")
     used = _change_structure(progress, tell) if bench.reference is None and applies(bench.twin) else 0
+    took, needed = 0.0, bench.target.roller.usual()  # [s], substeps of the last round
     for number in range(used, config.causes):
-        if number and progress.late():
-            progress.notes.append(f"stopped after {number} rounds: --seconds {config.seconds:g} were used up")
+        needs = progress.bench.target.roller.usual()
+        slower = needs / needed  # what was named may need many more substeps
+        if number and progress.late(took * slower if slower > SLOWER else 0.0):
+            progress.notes.append(f"stopped after {number} rounds: no time for more within --seconds {config.seconds:g}")
             break
+        started = time.monotonic()
         if not one_round(progress, tell, number):
             break
+        took, needed = time.monotonic() - started, needs
         found = progress.named[-1]
         tell(f"named: {found.judged.trial.id}, closes {found.closed:.0%} of the excess")
     finish(progress)
