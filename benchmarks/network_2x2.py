@@ -45,10 +45,12 @@ ROPE = shlex.split(
     "--evaluate-every 100 --arc-frequencies 3 --encoder-layers 2 --feature 32 --embedding 32 --feedforward 64 "
     "--encoder-feedforward 64"
 )
-WIDE = [*TRAIN, "--no-guard", "--cap", "0.1", "--penalty", "0.01"]
+TIGHT = [*TRAIN, "--no-guard"]
+WIDE = shlex.split("--cap 0.1 --penalty 0.01")
+FREE = shlex.split("--cap 0.5 --penalty 0.01")  # 0.1 m/s binds most components on a base that lacks the damping
 SETTINGS: dict[str, dict[str, list[str]]] = {
-    "cable": {"tight": [*TRAIN, "--no-guard"], "wide": WIDE},
-    "case": {"long": ROPE, "short": [*ROPE, "--rollout", "5"]},
+    "cable": {"tight": TIGHT, "wide": [*TIGHT, *WIDE], "free": [*TIGHT, *FREE]},
+    "case": {"long": ROPE, "short": [*ROPE, "--rollout", "5", "--learning-rate", "3e-3"]},
 }
 BACKBONES = ("base", "extended")
 NETWORK = " + network"
@@ -77,15 +79,17 @@ def main() -> int:
     case.add_argument("dataset", type=Path)
     case.add_argument("--base", type=Path, required=True, help="the twin that was questioned")
     case.add_argument("--extended", type=Path, required=True, help="the twin that `pred diagnose` wrote")
-    for kind, steps in ((cable, 3000), (case, 1500)):
+    for kind, steps, every in ((cable, 3000, SETTINGS["cable"]), (case, 1500, SETTINGS["case"])):
         kind.add_argument("--out", type=Path, required=True)
         kind.add_argument("--steps", type=int, default=steps, help="training steps of each network")
+        kind.add_argument("--settings", nargs="+", choices=every, default=[*every], help="to choose from")
     args = parser.parse_args()
+    settings = {name: SETTINGS[args.kind][name] for name in args.settings}
     if args.kind == "case":
         setup = Setup(args.dataset, {"base": args.base, "extended": args.extended}, args.out, args.steps)
-        tables = published(setup, SETTINGS["case"], "mde")[0]
+        tables = published(setup, settings, "mde")[0]
     else:
-        tables = of_cable(args.cable, args.out / args.cable, args.steps, args.folds, args.fold_steps)
+        tables = of_cable(args.cable, args.out / args.cable, settings, args.steps, args.folds, args.fold_steps)
     for split, errors in tables.items():
         print("\n".join(markdown(split, errors)), flush=True)
     out = args.out if args.kind == "case" else args.out / args.cable
@@ -94,7 +98,9 @@ def main() -> int:
     return 0
 
 
-def of_cable(cable: str, root: Path, steps: int, folds: int, fold_steps: int) -> dict[str, Errors]:
+def of_cable(
+    cable: str, root: Path, settings: Mapping[str, list[str]], steps: int, folds: int, fold_steps: int
+) -> dict[str, Errors]:
     """Published split, and grouped by recording if there are folds."""
     data = root / "data"
     if not (data / "dataset.yaml").exists():
@@ -103,7 +109,7 @@ def of_cable(cable: str, root: Path, steps: int, folds: int, fold_steps: int) ->
         identify(data, root / name, IDENTIFY[name])
     identify(data, root / "extended", [*IDENTIFY["extended"], "--base", str(root / "chain")])
     twins = {"base": root / "paper", "extended": root / "extended"}
-    tables, chosen = published(Setup(data, twins, root / "network", steps), SETTINGS["cable"], "coordinate_l1")
+    tables, chosen = published(Setup(data, twins, root / "network", steps), settings, "coordinate_l1")
     if folds:
         tables["grouped"] = grouped(load_dataset(data), root, folds, fold_steps, chosen)
     return tables
