@@ -70,7 +70,7 @@ def diagnose(
         needs = progress.bench.target.roller.usual()
         slower = needs / needed  # what was named may need many more substeps
         if number and progress.late(took * slower if slower > SLOWER else 0.0):
-            progress.notes.append(f"stopped after {number} rounds: no time for more within --seconds {config.seconds:g}")
+            progress.notes.append(f"stopped after {number} rounds: no time for more in --seconds {config.seconds:g}")
             break
         started = time.monotonic()
         if not one_round(progress, tell, number):
