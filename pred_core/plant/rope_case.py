@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from pred_core.bag.dataset import Dataset
 from pred_core.config import to_mapping
-from pred_core.errors import ConfigError
+from pred_core.errors import ConfigError, DivergenceError
 from pred_core.plant.case import Progress, write_case
 from pred_core.plant.hidden.effect import HiddenEffect
 from pred_core.plant.hidden.library import check_magnitude, find_entry, make_effect
@@ -17,6 +19,8 @@ from pred_core.plant.session import EpisodePlan, SessionConfig
 from pred_core.plant.world import Record, World, run_episode
 
 Hidden = tuple[tuple[str, float], ...]  # effect name, magnitude
+PARTS = (1, 2, 4, 8)  # MuJoCo's steps in a `STEP`, one after the other until one holds
+BLOCKED = 1e-3  # [m] off its reference; the drive alone stays within a tenth of it
 
 
 def write_rope_case(
@@ -67,8 +71,35 @@ def write_rope_case(
 def simulate_rope(
     plan: EpisodePlan, hidden: Hidden, seed: int, seconds: float, particles: int, rope: RopeConfig | None = None
 ) -> tuple[Record, tuple[HiddenEffect, ...]]:
-    """One episode in MuJoCo: what happened, and the effects, fresh for this episode, that act on its measurement."""
-    effects = tuple(make_effect(name, magnitude, seed, place) for place, (name, magnitude) in enumerate(hidden))
-    built = build_rope(rope or RopeConfig(), reversed=plan.motion.variant == "regrasp")
-    world = World(built, effects, plan.start)
-    return run_episode(world, plan.motion, seconds, particles), effects
+    """One episode in MuJoCo: what happened, and the effects, fresh for this episode, that act on its measurement.
+
+    A whip of the free end, or a rope that is laid into an obstacle, can be too fast for MuJoCo's step: such an episode,
+    and no other, is simulated anew with a finer one. Raises: DivergenceError if the finest does not hold either, or if
+    what is hidden keeps the gripper from where it is said to be.
+    """
+    for parts in PARTS:
+        effects = tuple(make_effect(name, magnitude, seed, place) for place, (name, magnitude) in enumerate(hidden))
+        built = build_rope(rope or RopeConfig(), reversed=plan.motion.variant == "regrasp")
+        world = World(built, effects, plan.start)
+        try:
+            record = run_episode(world, plan.motion, seconds, particles, parts)
+        except DivergenceError as error:
+            if parts == PARTS[-1]:
+                raise DivergenceError(f"{plan.name}: {error}") from error
+            continue
+        if parts > 1:
+            check_gripper(record, plan.name)
+        break
+    return record, effects
+
+
+def check_gripper(record: Record, name: str) -> None:
+    """Raise DivergenceError if the gripper did not go where it was told: its recorded poses would be wrong."""
+    off = float(np.linalg.norm((record.gripper - record.reference)[:, :3], axis=1).max())
+    if off > BLOCKED:
+        raise DivergenceError(
+            f"{name}: what is hidden stands in the gripper's way",
+            got=f"{1e3 * off:.1f} mm off its path",
+            allowed=f"{1e3 * BLOCKED:g} mm",
+            next_step="Use another seed, or a smaller magnitude",
+        )

@@ -98,6 +98,10 @@ class World:
         """Add forces (L, 3) [N] at the middles of the links for this step."""
         self.data.xfrc_applied[self.links, :3] += force
 
+    def finer(self, parts: int) -> None:
+        """From now on MuJoCo's step is this part of `STEP`; contacts and springs keep their own times."""
+        self.model.opt.timestep = STEP / parts
+
     def step(self, drive: Pusher | None = None, index: int = 0, drag: float = 0.0) -> None:
         """One MuJoCo step; the drive follows its reference `index`."""
         mujoco.mj_step1(self.model, self.data)
@@ -138,14 +142,17 @@ class World:
                     self.load[link] += force[0]
 
 
-def run_episode(world: World, motion: Motion, seconds: float, particles: int) -> Record:
+def run_episode(world: World, motion: Motion, seconds: float, particles: int, parts: int = 1) -> Record:
     """Settle the rope, then move it for `seconds` [s]; `particles` material points evenly along the rope.
 
-    Raises: DivergenceError if MuJoCo's state blows up.
+    parts: MuJoCo's steps in a `STEP`, at whose beginnings it is recorded. Raises: DivergenceError if MuJoCo's state
+    blows up.
     """
     settle, steps, lead = round(SETTLE / STEP), round(seconds / STEP), round(LEAD / STEP)
     count = settle + steps + 2
-    drive = Drive(motion.path(-SETTLE, count, STEP))
+    asked = motion.path(-SETTLE, count, STEP)
+    drive = Drive(asked if parts == 1 else motion.path(-SETTLE, parts * count, STEP / parts))
+    world.finer(parts)
     drive.place(world.data)
     lay(world, motion)
     world.time = -SETTLE
@@ -163,7 +170,11 @@ def run_episode(world: World, motion: Motion, seconds: float, particles: int) ->
             if row >= 0:
                 position[row] = world.material_points(arc)
                 gripper[row] = world.data.qpos[:DOF]
-            world.finish_step(drive, k, SETTLE_DRAG if world.time < -FREE else 0.0)
+            drag = SETTLE_DRAG if world.time < -FREE else 0.0
+            world.finish_step(drive, parts * k, drag)
+            for part in range(1, parts):
+                world.time = (k - settle + part / parts) * STEP
+                world.step(drive, parts * k + part, drag)
             if warnings:
                 break
     speed = float(np.abs(np.diff(position[: max(row + 1, 0)], axis=0)).max(initial=0.0)) / STEP
@@ -171,12 +182,12 @@ def run_episode(world: World, motion: Motion, seconds: float, particles: int) ->
         raise DivergenceError(
             "the rope's simulation became unstable",
             got=warnings[0] if warnings else f"{speed:.3g} m/s",
-            next_step="Use a smaller magnitude",
+            next_step="Use another seed" + (", or a smaller magnitude" if world.effects else ""),
         )
     if world.rope.reversed:
         position = position[:, ::-1]
     time = STEP * np.arange(-lead, len(position) - lead, dtype=np.float64)
-    return Record(time, np.ascontiguousarray(position), gripper, drive.path.position[settle - lead :])
+    return Record(time, np.ascontiguousarray(position), gripper, asked.position[settle - lead :])
 
 
 def lay(world: World, motion: Motion) -> None:
