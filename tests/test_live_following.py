@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
+import yaml
 
 from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
@@ -52,8 +54,8 @@ def follow(
     return given
 
 
-def follower(**config: float) -> Follower:
-    return Follower(load_dynamics(TWIN), TWIN.body, {0: 0, 1: 0}, Rules(), config=EstimatorConfig(**config))
+def follower(rules: Rules | None = None, **config: float) -> Follower:
+    return Follower(load_dynamics(TWIN), TWIN.body, {0: 0, 1: 0}, rules or Rules(), config=EstimatorConfig(**config))
 
 
 def test_it_starts_and_gives_a_state_at_each_period_and_correction() -> None:
@@ -101,6 +103,24 @@ def test_without_tracks_it_stops_giving_states_and_goes_on_when_they_are_back() 
     assert last <= BEGIN + 55 * TICK + 1_000_000_000 and one.condition().level == "stopped"
     assert "no state is given" in one.condition().trouble()
     assert follow(one, range(200, 230)) and one.condition().level == "ok" and one.counts.runs == 1
+
+
+@pytest.mark.parametrize("nodes", ["live", "reroute"])
+def test_a_short_hole_in_the_poses_is_bridged_as_configured_and_a_longer_one_is_a_new_start(nodes: str) -> None:
+    """0.4 s without poses and tracks, then one pose: the states of the hole come at once, and the run goes on."""
+    path = Path(__file__).parents[1] / "config" / "nodes" / f"{nodes}.yaml"
+    given = yaml.safe_load(path.read_text())["predictor"]["ros__parameters"]["max_gap"]
+    bridged, plain, longer = follower(Rules(max_gap=given)), follower(), follower(Rules(max_gap=given))
+    for one in (bridged, plain, longer):
+        follow(one, range(60))
+    states = follow(bridged, range(90, 91), every=0)
+    period = round(TWIN.meta.period * 1e9)
+    assert len(states) >= 30 * TICK // period - 1 and BEGIN + 90 * TICK - states[-1].stamp < period + TICK
+    assert (bridged.counts.runs, bridged.counts.gaps) == (1, 0)
+    assert np.abs(states[-1].state.position.numpy() - hanging()).max() < 0.008
+    assert follow(plain, range(90, 91), every=0) == [] and plain.counts.gaps == 1
+    assert follow(longer, range(120, 121), every=0) == [] and longer.counts.gaps == 1, "0.8 s"
+    assert follow(longer, range(121, 160)) and longer.counts.runs == 2
 
 
 def test_frames_older_than_the_history_are_counted() -> None:
