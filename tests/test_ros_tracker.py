@@ -131,11 +131,11 @@ def test_particles_lie_on_the_rope_and_carry_the_capture_stamp(rig: Rig) -> None
     assert (last.stamp - START) % STEP == 0
     assert last.id.tolist() == list(range(26))
     error = np.linalg.norm(last.position - rig.scene.truth(26), axis=-1)
-    # Two cameras of 320 x 240: where a 4 mm thick rope ends is known to one or two pixels of 3.3 mm and a cell of 6 mm.
-    assert error.mean() < 0.007 and error.max() < 0.016
+    # Two cameras of 320 x 240: the end of the rope is known to a pixel of 3.3 mm, a slide along it comes on top.
+    assert error.mean() < 0.007 and error.max() < 0.012
     assert last.visible.all()
     length = np.linalg.norm(np.diff(last.position, axis=0), axis=-1).sum()
-    assert length == pytest.approx(LENGTH, abs=0.016)
+    assert length == pytest.approx(LENGTH, abs=0.010)
     rig.show_until(lambda: rig.bench.says(OK, "tracking"), NAMES)
 
 

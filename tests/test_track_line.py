@@ -153,8 +153,10 @@ def test_a_line_of_unknown_length_is_found_whole_by_two_small_cameras(first: tup
             for k in range(1, 4):
                 estimate = feed(tracker, small, START + k * STEP, ("cam0", "cam1"))
             error = np.linalg.norm(estimate.tracks.position - small.truth(26), axis=-1)
-            # Where a 4 mm thick rope ends is known to one or two pixels of 3.3 mm and a cell of 6 mm.
-            assert error.mean() < 0.007 and error.max() < 0.016, f"noise {seed}"
+            # The end of the rope is known to a pixel of 3.3 mm, a slide along it comes on top.
+            assert error.mean() < 0.005 and error.max() < 0.012, f"noise {seed}"
+            length = np.linalg.norm(np.diff(estimate.tracks.position, axis=0), axis=-1).sum()
+            assert length == pytest.approx(LENGTH, abs=0.010), f"noise {seed}"
     finally:
         small.close()
 

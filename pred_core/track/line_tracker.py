@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pred_core.config import setting
+from pred_core.track.color_model import ColorModel
 from pred_core.track.estimate import Estimate, Prior, Status, odd_one, trace_confidence
 from pred_core.track.grasp import Grasp, GraspConfig
+from pred_core.track.line_ends import LEAST, LineEnds, extended
 from pred_core.track.line_fit import (
     SURFACE,
     Anchors,
@@ -23,11 +25,11 @@ from pred_core.track.line_fit import (
     without_view,
 )
 from pred_core.track.line_start import FoundLine, LineStartConfig, find_line, resample
+from pred_core.track.line_width import radius_of
 from pred_core.track.view import View
 from pred_core.types import Array, Tracks
 
 Poses = tuple[Array, Array]
-WIDTH_OF_UNIFORM = np.sqrt(3.0)  # half width over standard deviation of points spread evenly over a width
 OBSTACLE = 0.015  # [m] before a node, beyond errors of depth and of the fit
 SAME_TIME = 10_000_000  # [ns]
 GROWN = 0.03  # of the length: less is noise
@@ -70,6 +72,7 @@ class LineTracker:
         self._bad_since: int | None = None
         self._pulled = False  # a gripper that it has slipped out of has pulled the nodes along
         self._found_at: int | None = None  # [ns] when its length was measured
+        self._ends = LineEnds()
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
 
     @property
@@ -96,7 +99,7 @@ class LineTracker:
         cuts = np.cumsum([len(v.pixel) for v in views])[:-1]
         members = [v.select(m) for v, m in zip(views, np.split(found.member, cuts), strict=True)]
         nodes = resample(path, self.config.particles)
-        radius = self.config.radius or _radius(members, nodes)
+        radius = self.config.radius or radius_of(members, nodes)
         cloud = self._cloud(members, stamp, radius)
         ends = self._ends_in_tools(nodes, poses, closed)
         nodes, length = _settle(nodes, cloud, radius, self.config, self.length if known else None, ends)
@@ -108,7 +111,7 @@ class LineTracker:
         self.radius, self.nodes, self.stamp = radius, nodes, stamp
         self.velocity = np.zeros_like(nodes)
         self._variance = np.full(len(nodes), STILL**2)
-        self._bad_since, self._closed = None, closed
+        self._bad_since, self._closed, self._ends = None, closed, LineEnds()
         self.grasp.bind(nodes, poses, closed)
         return members
 
@@ -118,8 +121,9 @@ class LineTracker:
         stamp: int,
         poses: Poses | None,
         prior: Prior | None = None,
+        color: ColorModel | None = None,
     ) -> Estimate:
-        """Follow the line to `stamp` [ns]. `prior` is used instead of constant velocity."""
+        """Follow the line to `stamp` [ns]. `prior` is used instead of constant velocity; `color` is the line's."""
         assert self.nodes is not None  # `start` has succeeded; the caller's bug otherwise
         cameras = tuple(v.camera for v in views)
         self._grow(views, stamp, poses)
@@ -149,6 +153,7 @@ class LineTracker:
         score = fit.explained - _contradicted(views, fit)
         if score < self.config.doubt:
             fit = self._second_opinion(fit, score, views, stamp, poses)
+        fit = self._trim(fit, views, stamp, poses, color)
         visible = fit.views.max(axis=0, initial=0.0) >= self.config.seen
         self._advance(fit, dt, visible, sigma)
         self.stamp = stamp
@@ -156,12 +161,35 @@ class LineTracker:
 
     def _grow(self, views: Sequence[View], stamp: int, poses: Poses | None) -> None:
         """The first pictures may have missed an end: start again where a later one shows more of the line."""
-        if self._found_at is None or (stamp - self._found_at) * 1e-9 > self.config.growing:
+        if not self._growing(stamp):
             return
         found = _find(views, self.config.start)
         if found is None or found.length < (1.0 + GROWN) * self.length or not self._is_on(found.path):
             return
         self._begin(found, views, stamp, poses, self._closed, known=False)
+
+    def _growing(self, stamp: int) -> bool:
+        return self._found_at is not None and (stamp - self._found_at) * 1e-9 <= self.config.growing
+
+    def _trim(
+        self, fit: LineFit, views: Sequence[View], stamp: int, poses: Poses | None, color: ColorModel | None
+    ) -> LineFit:
+        """Where a measured length may still change: move free ends to where the pictures say that they are."""
+        if not self._growing(stamp):
+            return fit
+        newest = max((v.stamp for v in views), default=0)
+        self._ends.watch(fit.nodes, self.radius, [v for v in views if newest - v.stamp < SAME_TIME], color)
+        tools = self._ends_in_tools(fit.nodes, poses, self._closed)
+        first, last = self._ends.correction((bool(tools.information[0].any()), bool(tools.information[-1].any())))
+        if max(abs(first), abs(last)) < LEAST:
+            return fit
+        nodes = resample(extended(fit.nodes, first, last), len(fit.nodes))
+        for end in (0, -1):
+            nodes[end] = tools.target[end] if tools.information[end].any() else nodes[end]
+        self._ends.moved(first, last)
+        self.length = float(np.linalg.norm(np.diff(nodes, axis=0), axis=-1).sum())
+        self.grasp.bind(nodes, poses, self._closed)
+        return dataclasses.replace(fit, nodes=nodes)
 
     def _is_on(self, path: Array) -> bool:
         """Whether the nodes lie on a path (K, 3)."""
@@ -307,27 +335,3 @@ def _settle(
         fit = fit_line(nodes, spacing, cloud, radius, config.fit, ends, iterations=3)
         nodes = fit.nodes if total is not None else resample(fit.nodes, len(nodes))
     return nodes, float(np.linalg.norm(np.diff(nodes, axis=0), axis=-1).sum())
-
-
-def _radius(views: Sequence[View], nodes: Array) -> float:
-    """Radius [m] from how wide the line looks: half its width in the camera that sees most of it, from the spread."""
-    from scipy.spatial import cKDTree
-
-    along = np.gradient(nodes, axis=0)
-    along /= np.linalg.norm(along, axis=-1, keepdims=True)
-    widest = 0.0
-    for view in views:
-        if len(view.pixel) < 50:
-            continue
-        distance, near = cKDTree(nodes).query(view.points)
-        across = np.cross(along[near], view.rays)
-        size = np.linalg.norm(across, axis=-1)
-        usable = (size > 0.3) & (distance < 0.03)
-        if usable.sum() < 50:
-            continue
-        off = np.einsum("ma,ma->m", view.points - nodes[near], across)[usable] / size[usable]
-        for index in np.unique(near[usable]):  # the rough path may run beside the middle
-            at = near[usable] == index
-            off[at] -= off[at].mean()
-        widest = max(widest, float(WIDTH_OF_UNIFORM * off.std()))
-    return widest

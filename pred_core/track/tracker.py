@@ -110,7 +110,7 @@ class Tracker:
             views = [self._views[v.camera] for v in views]
         prior = self._prior if self._prior is not None and abs(stamp - self._prior.stamp) * 1e-9 < 0.5 else None
         if self.config.kind == "line":
-            estimate = self._line.update(views, stamp, poses, prior)
+            estimate = self._line.update(views, stamp, poses, prior, self.mask.color)
         else:
             estimate = self._surface.update(frames, stamp, poses, prior)
         if estimate.status == "lost":
