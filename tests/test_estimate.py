@@ -357,6 +357,25 @@ def test_the_filter_is_kalmans() -> None:
     assert errors._covariance.shape == (2 * m, 2 * m) and errors.variance()[9] < evidence.variance[1]
 
 
+def test_a_line_whose_springs_reach_far_may_be_bent_by_tracks() -> None:
+    """Springs over several particles stand for bending. A full turn of a circle has a straight line's neighbour
+    lengths, but chords over 4 edges that are sin(2 a) / (4 sin(a / 2)) = 0.933 times as long (a: 360 degrees / 19)."""
+    x = np.zeros((20, 3))
+    x[:, 0] = 0.025 * np.arange(20)
+    physics = Physics(stiffness=30.0, damping=0.01, connection_threshold=0.11, max_springs=8)
+    body = build_body("line", x, 0.05, physics)
+    assert np.ptp(body.springs, axis=1).max() == 4
+    turn = np.deg2rad(360.0) / 19 * (np.arange(19) + 0.5)
+    arc = np.zeros((20, 3))
+    arc[1:, :2] = 0.025 * np.cumsum(np.stack([np.cos(turn), np.sin(turn)], axis=1), axis=0)
+    chords = np.linalg.norm(arc[4:] - arc[:-4], axis=1) / 0.1
+    assert chords == pytest.approx(0.933, abs=0.001)
+    lengths = Lengths(body, np.ones(20))
+    assert np.allclose(lengths.keep(x, arc), arc, atol=1e-9)
+    stretched = lengths.keep(x, 1.05 * arc)
+    assert np.linalg.norm(np.diff(stretched, axis=0), axis=1) == pytest.approx(0.025, rel=1e-3)
+
+
 def net(kind: str, side: int, reach: float, most: int) -> Body:
     """A square net or a cube of particles, 3 cm apart."""
     axes = np.meshgrid(*[np.arange(side)] * (3 if kind == "volume" else 2), indexing="ij")

@@ -30,6 +30,9 @@ class Lengths:
     def __init__(self, body: Body, free: Array):
         i, j = body.springs[:, 0].astype(np.int64), body.springs[:, 1].astype(np.int64)
         moving = free[i] + free[j] > 0
+        if body.kind == "line":  # springs that reach farther stand for bending: they change when it bends
+            place = np.argsort(np.argsort(body.arc, kind="stable"))
+            moving &= np.abs(place[i] - place[j]) == 1
         self._i, self._j = i[moving], j[moving]
         self._weight = np.repeat(free * body.mass.mean() / body.mass, 3)  # (3 N,) mobilities
         self._root = np.sqrt(self._weight)
