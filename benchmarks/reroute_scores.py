@@ -1,25 +1,21 @@
-"""What the trials say: success with exact intervals, chamfer against time, seconds a replan, collisions; a report."""
+"""What the trials say: success with exact intervals and in pairs, chamfer against time, computing, collisions."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from hidden_scores import clopper_pearson
-from matplotlib.figure import Figure
+from reroute_figures import COLORS, curves, settings_of, shares, views
 
 from pred_core.bag.deform import SOURCE_FILE
 from pred_core.errors import InputError
-from pred_core.plant.live.slot import SlotConfig
 from pred_core.report.page import Page
-from pred_core.types import Array
 
-COLORS = {"pred": "#009E73", "spring-mass": "#D55E00"}
-OTHER = "#0072B2"
-GRID = 0.4  # [s] of the curves
 HEADER = ("trials", "through", "95 % interval", "time to it [s]", "chamfer at the end [mm]", "rope on slot [s]",
           "hand on slot", "state error [mm]", "CPU s a replan", "plans refused")  # fmt: skip
 
@@ -34,6 +30,8 @@ def write_scores(work: Path) -> int:
     print("|" + "---|" * (len(HEADER) + 1))
     for line in rows:
         print("| " + " | ".join(line) + " |")
+    pairs = [line for setting in settings_of(groups) if (line := paired_line(groups, setting))]
+    print("\n".join(pairs))
     page = Page("A cable led through a slot")
     page.table(("twin, eyes, gap, cable", *HEADER), rows)
     page.text(
@@ -41,10 +39,13 @@ def write_scores(work: Path) -> int:
         "an odd number of crossings, the gripper below the top, at two looks in a row. The interval is Clopper and "
         "Pearson's. Time, contact and errors are means; time over the trials that succeeded.", note=True,
     )  # fmt: skip
+    for line in pairs:
+        page.text(line)
+    page.figure(shares(groups), "Share of the trials that are through, against time.")
     page.figure(curves(groups), "Chamfer distance (two-sided, unsquared) of the true rope to the goal: each trial, and "
                 "the median of all, where a trial that ended keeps its last value.")  # fmt: skip
-    page.figure(views(groups), "From above, the first trials of each: goal (grey), the rope at the end, the gripper's "
-                "way (dotted).")  # fmt: skip
+    page.figure(views(groups), "From above, some trials of each, those that failed first: goal (grey), the rope at the "
+                "end, the gripper's way (dotted).")  # fmt: skip
     page.write(work / "report.html")
     print(f"wrote {work / 'scores.json'} and {work / 'report.html'}")
     return 0
@@ -95,60 +96,23 @@ def row(s: dict[str, Any]) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def curve(trials: Sequence[dict[str, Any]]) -> tuple[Array, Array]:
-    """Times (T,) [s] and the median chamfer distance (T,) [mm]; a trial that ended keeps its last value."""
-    longest = max(t["chamfer"][-1][0] for t in trials)
-    times = np.arange(0.0, longest + 0.5 * GRID, GRID)
-    values = [np.interp(times, *np.array(t["chamfer"]).T) for t in trials]
-    return times, 1e3 * np.median(values, axis=0)
+def paired_line(groups: dict[str, list[dict[str, Any]]], setting: str) -> str:
+    """The twins on the same starts, and the exact two-sided sign test; empty where only one was tried."""
+    good = [{t["seed"]: t["success"] for t in groups.get(f"{twin}-{setting}", [])} for twin in COLORS]
+    both = sorted(good[0].keys() & good[1].keys())
+    if not both:
+        return ""
+    only = [sum(good[k][s] and not good[1 - k][s] for s in both) for k in (0, 1)]
+    p = sign_test(*only)
+    a, b = COLORS
+    return f"{setting}, {len(both)} same starts: only {a} {only[0]}, only {b} {only[1]} (sign test p = {p:.2g})"
 
 
-def curves(groups: dict[str, list[dict[str, Any]]]) -> Figure:
-    """One panel for what differs beside the twin."""
-    panels: dict[str, list[str]] = {}
-    for name in groups:
-        panels.setdefault(_setting(name), []).append(name)
-    figure = Figure(figsize=(5.5 * len(panels), 3.6), layout="constrained")
-    for axes, (title, names) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
-        for name in names:
-            color = COLORS.get(_twin(name), OTHER)
-            for trial in groups[name]:
-                axes.plot(*(np.array(trial["chamfer"]) * [1.0, 1e3]).T, color=color, alpha=0.2, linewidth=0.8)
-            axes.plot(*curve(groups[name]), color=color, linewidth=2.2, label=_twin(name))
-        axes.set(xlabel="time [s]", ylabel="chamfer distance to the goal [mm]", title=title)
-        axes.set_ylim(bottom=0)
-        axes.legend(frameon=False)
-    return figure
-
-
-def views(groups: dict[str, list[dict[str, Any]]], most: int = 6) -> Figure:
-    """Ropes from above."""
-    figure = Figure(figsize=(2.4 * most, 2.6 * len(groups)), layout="constrained")
-    slot = SlotConfig()
-    across = 0.5 * slot.width * slot.world_from_slot[:2, 1]
-    grid = figure.subplots(len(groups), most, squeeze=False)
-    for panels, (name, trials) in zip(grid, groups.items(), strict=True):
-        for axes in panels:
-            axes.set_axis_off()
-        for axes, trial in zip(panels, trials[:most], strict=False):
-            for post in slot.boxes:
-                ends = np.array(post.center[:2]) + np.outer([-1.0, 1.0], across)
-                axes.plot(*ends.T, color="#57606a", linewidth=3, solid_capstyle="butt")
-            axes.plot(*np.array(trial["goal"])[:, :2].T, color="#8c959f", linewidth=1.2)
-            axes.plot(*np.array(trial["rope"])[:, :2].T, color=COLORS.get(_twin(name), OTHER), linewidth=2)
-            axes.plot(*np.array(trial["way"])[:, :2].T, ":", color="#1b1f24", linewidth=1)
-            axes.set_aspect("equal")
-            axes.set_title(f"{name}\n{trial['seed']}: {trial['outcome'][:24]}", fontsize=6)
-    return figure
+def sign_test(a: int, b: int) -> float:
+    """Two-sided p of a against b among a + b differing pairs; 1 where there is none."""
+    tail = sum(math.comb(a + b, k) for k in range(min(a, b) + 1)) / 2.0 ** (a + b)
+    return min(1.0, 2.0 * tail)
 
 
 def _mean(values: Sequence[float]) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
-
-
-def _twin(name: str) -> str:
-    return next((t for t in COLORS if name.startswith(t)), name)
-
-
-def _setting(name: str) -> str:
-    return name.removeprefix(_twin(name)).strip("-")

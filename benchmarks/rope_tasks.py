@@ -23,7 +23,7 @@ import torch
 from reroute import TWINS, about
 from reroute_cell import DrivenCell, go
 from reroute_eyes import TrueEyes
-from reroute_scores import curve, curves
+from reroute_figures import curve, curves
 from reroute_trial import Trial, TrialConfig, check_twin, open_cell, write_whole
 
 from pred_core.bag.deform import SOURCE_FILE, claim_folder

@@ -26,8 +26,8 @@ from pred_core.twin import Twin, TwinMeta
 from pred_core.types import ObjectInfo, Physics, Scene
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
-MODULES = ("hidden_scores", "measured_cables", "reroute_cell", "reroute_eyes", "reroute_trial", "reroute_scores",
-           "reroute", "rope_tasks")  # fmt: skip
+MODULES = ("hidden_scores", "measured_cables", "reroute_cell", "reroute_eyes", "reroute_trial", "reroute_figures",
+           "reroute_scores", "reroute", "rope_tasks")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -178,10 +178,25 @@ def test_ten_of_ten_is_no_certainty(bench) -> None:
     assert score["interval"] == pytest.approx([0.025 ** 0.1, 1.0]), "p^10 = 0.025 at 0.69"
 
 
+def test_twins_are_compared_on_the_same_starts(bench) -> None:
+    scores = bench["reroute_scores"]
+    # 5 to 0 of differing pairs: 2 / 2^5; 3 to 1: 2 (1 + 4) / 16; nothing differs: 1.
+    assert scores.sign_test(5, 0) == scores.sign_test(0, 5) == pytest.approx(1 / 16)
+    assert (scores.sign_test(3, 1), scores.sign_test(0, 0), scores.sign_test(2, 2)) == pytest.approx((0.625, 1, 1))
+    groups = {
+        "pred-truth-gap24-cable0": [trial_result(k, k != 3, 0.1) for k in range(4)],
+        "spring-mass-truth-gap24-cable0": [trial_result(k, k == 0, 0.1) for k in range(1, 5)],
+        "pred-cameras-gap24-cable0": [trial_result(0, True, 0.1)],
+    }
+    line = scores.paired_line(groups, "truth-gap24-cable0")
+    assert "3 same starts: only pred 2, only spring-mass 0" in line and "p = 0.5" in line
+    assert scores.paired_line(groups, "cameras-gap24-cable0") == ""
+
+
 def test_the_median_curve_keeps_what_a_trial_ended_with(bench) -> None:
     short, long = trial_result(0, True, 0.1), trial_result(1, False, 0.3)
     long["chamfer"] = [[0.0, 0.3], [0.8, 0.3]]
-    times, values = bench["reroute_scores"].curve([short, long])
+    times, values = bench["reroute_figures"].curve([short, long])
     assert times.tolist() == pytest.approx([0.0, 0.4, 0.8])
     assert values.tolist() == pytest.approx([300.0, 200.0, 200.0])
 
