@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+GONE = "says nothing any more: it has ended, or hangs"  # what the watch says of a node without diagnostics
 CAMERAS = ("cam0", "cam1", "cam2", "cam3")
 
 
@@ -98,7 +99,7 @@ FAULTS: dict[str, Fault] = {
                 Step(0.0, "the planner is killed", lambda hands: hands.kill("planner")),
                 Step(4.0, "the planner is started again", lambda hands: hands.restart("planner")),
             ),
-            (("arm", "waiting for a command"),),
+            (("planner", GONE),),
         ),
         Fault(
             "bumped_camera",

@@ -37,11 +37,14 @@ from pred_core.bag.writer import BagWriter
 from pred_core.errors import InputError
 from pred_core.plant.live.success import judge_passage
 from pred_ros import convert, planner_messages, qos
-from pred_ros.reroute_record import PlanSeen, Record, Said, View
+from pred_ros.reroute_faults import GONE
+from pred_ros.reroute_record import NS, PlanSeen, Record, Said, View
 
 DIAGNOSTICS = "/diagnostics"
 TRUTH = "plant/truth"
 JPEG_QUALITY = 80
+SILENT = 2.5  # [s] of the cell's time without diagnostics, which come once a second: the node has ended or hangs
+ERROR = 2  # level of what is said of it
 ANSWER, AGAIN = 120.0, 8.0  # [s] on the wall for a service, and until it is asked again
 
 
@@ -51,6 +54,7 @@ class Watch:
     def __init__(self, record: Record, writer: BagWriter, camera: str | None):
         """camera: whose pictures are kept, None: none."""
         self.record, self._writer, self._camera = record, writer, camera
+        self._heard: dict[str, int] = {}  # node -> [ns] its newest diagnostics
         self.node = rclpy.create_node("watch")
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
@@ -134,6 +138,9 @@ class Watch:
 
     def _on_clock(self, message: Clock) -> None:
         self.record.now = message.clock.sec * 10**9 + message.clock.nanosec
+        for node, stamp in self._heard.items():
+            if self.record.now - stamp > SILENT * NS and self.record.status[node].message != GONE:
+                self._say(Said(self.record.now, node, ERROR, GONE))
 
     def _on_truth(self, message: PointCloud2) -> None:
         frame = read_tracker_points(message, TRUTH)
@@ -163,16 +170,20 @@ class Watch:
         for status in message.status:
             node = status.name.lstrip("/")
             said = Said(self.record.now, node, int.from_bytes(status.level, "little"), status.message)
+            self._heard[node] = self.record.now
             before = self.record.status.get(node)
             if before is None or (before.level, before.message) != (said.level, said.message):
-                self.record.status[node] = said
-                self.record.said.append(said)
+                self._say(said)
             values = {v.key: v.value for v in status.values}
             known = self.record.values.get(node, {})
             self.record.values[node] = values
             if node == "planner" and "planning [s]" in values and values["planning [s]"] != known.get("planning [s]"):
                 row = (self.record.now, float(values["planning [s]"]), int(values["motions tried"]))
                 self.record.planning.append(row)
+
+    def _say(self, said: Said) -> None:
+        self.record.status[said.node] = said
+        self.record.said.append(said)
 
     def _on_info(self, message: CameraInfo) -> None:
         self._intrinsics = images.read_camera_info(message, f"{self._camera}/{images.INFO}")[0]

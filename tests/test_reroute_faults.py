@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not installed")
 pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
+import rclpy
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from ros_bench import own_domain
+from rosgraph_msgs.msg import Clock
+
+from pred_core.bag.writer import BagWriter
 from pred_core.plant.live.slot import SlotConfig
 from pred_core.plant.live.success import Passage
 from pred_ros import reroute
-from pred_ros.reroute_faults import FAULTS
+from pred_ros.reroute_faults import FAULTS, GONE
 from pred_ros.reroute_record import PlanSeen, Record, Said
 from pred_ros.reroute_verdict import Verdict, judge
+from pred_ros.reroute_watch import Watch
 
 S = 1_000_000_000  # [ns]
 BEGIN = 3 * S  # of the fault
@@ -37,7 +47,7 @@ SCRIPT: dict[str, tuple[list[tuple[object, ...]], tuple[str, str]]] = {
     ),
     "planner_killed": (
         [(0.0, "kill", "planner"), (4.0, "restart", "planner")],
-        ("arm", "armed, waiting for a command"),
+        ("planner", "says nothing any more: it has ended, or hangs"),
     ),
     "bumped_camera": (
         [(0.0, "dead", "", "cam1")],
@@ -109,6 +119,29 @@ def test_a_fault_counts_if_it_was_named_the_arm_was_safe_and_the_task_done_where
     assert not reroute.passed(unsaid, fault), "said before, or by a node that has nothing to do with it"
     assert not reroute.passed(judged(name, True, told, hits=1), fault), "the gripper has hit the slot"
     assert reroute.passed(judged(name, False, told), fault) is not fault.reachable
+
+
+def test_a_node_without_diagnostics_is_said_to_be_gone_until_it_is_back(tmp_path: Path) -> None:
+    """Two nodes report once a second of the cell's time; the planner from 3 s to 8 s does not."""
+    record = Record(SlotConfig(), np.zeros((1, 3)))
+    with own_domain(), BagWriter(tmp_path / "run.mcap") as writer:
+        rclpy.init()
+        watch = Watch(record, writer, None)
+        try:
+            for tenth in range(101):
+                stamp = Time(sec=tenth // 10, nanosec=tenth % 10 * 10**8)
+                watch._on_clock(Clock(clock=stamp))
+                names = ["arm"] if 30 <= tenth < 80 else ["arm", "planner"]
+                status = [DiagnosticStatus(name=n, level=DiagnosticStatus.OK, message="fine") for n in names]
+                if tenth % 10 == 0:
+                    watch._on_diagnostics(DiagnosticArray(status=status))
+        finally:
+            watch.close()
+            rclpy.try_shutdown()
+    said = [(s.node, round(s.stamp / S, 1), s.message) for s in record.said]
+    # Heard last at 2 s: gone once more than 2.5 s have passed.
+    assert said == [("arm", 0.0, "fine"), ("planner", 0.0, "fine"), ("planner", 4.6, GONE), ("planner", 8.0, "fine")]
+    assert record.said[2].level == 2 and ("planner", GONE) in FAULTS["planner_killed"].named_by
 
 
 def test_what_is_said_long_after_the_last_step_does_not_name_a_fault() -> None:
