@@ -89,6 +89,22 @@ def test_first_seen_patch_corrects_a_wrong_pixel() -> None:
     assert correlation[0] > 0.95 and correlation[1] == 0.0, "30 px off is no match"
 
 
+def test_a_faint_print_is_an_anchor_and_a_plain_cloth_is_none() -> None:
+    rng = np.random.default_rng(5)
+    pixel, tangents = np.array([[50.0, 40.0], [90.0, 60.0]]), np.tile(np.eye(2), (2, 1, 1))
+    for contrast, found in ((12.0, True), (0.5, False)):  # grey levels; the print of the benchmark's cloth has 12
+        before, after = (
+            np.clip(128 + contrast / 40.0 * (speckle(s).astype(float) - 128) + rng.normal(0.0, 1.0, (120, 160)), 0, 255)
+            .round().astype(np.uint8) for s in ((0, 0), (4, 2))
+        )  # fmt: skip
+        templates = Templates.empty(2)
+        templates.keep(before, np.array([0, 1]), pixel, tangents, np.zeros((2, 3)))
+        place, correlation = templates.match(after, np.array([0, 1]), pixel + [4.7, 1.5], tangents)
+        assert (correlation > 0.0).tolist() == [found, found]
+        if found:  # noise of 1 level in both pictures, 225 pixels, gradients of 3 levels a pixel: 0.03 px
+            np.testing.assert_allclose(place, pixel + [4.0, 2.0], atol=0.2)
+
+
 def test_depth_at_an_edge_is_none() -> None:
     depth = np.ones((20, 20), np.float32)
     depth[:, 10:] = 1.5

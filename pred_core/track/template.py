@@ -16,7 +16,7 @@ from pred_core.types import Array
 
 SIDE = 15  # [px] of a patch
 ITERATIONS = 4
-LEAST_TEXTURE = 60.0  # smaller eigenvalue of the mean gradient matrix, grey levels squared
+LEAST_TEXTURE = 2.0  # smaller eigenvalue of the mean gradient matrix, grey levels squared: 0.1 px at noise of 2 levels
 FARTHEST = 5.0  # [px] a patch may be shifted
 LEAST_CORRELATION = 0.85
 
