@@ -19,7 +19,7 @@ from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.fit import Fit, fit, rho, without_groups
 from pred_core.diagnose.journal import Journal
-from pred_core.diagnose.judge import Bench, judge, screen
+from pred_core.diagnose.judge import Bench, Screened, judge, null_of, screen
 from pred_core.diagnose.naming import exploratory, one_recording, why_not
 from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.roll import Roller
@@ -27,7 +27,7 @@ from pred_core.diagnose.rounds import finish
 from pred_core.diagnose.run import diagnose, moved_markers
 from pred_core.diagnose.said import sentence
 from pred_core.diagnose.sample import Sample, make_sample
-from pred_core.diagnose.search import starts
+from pred_core.diagnose.search import Start, coordinates, starts
 from pred_core.diagnose.skill import skill_of
 from pred_core.diagnose.trial import Trial, make_trial
 from pred_core.diagnose.weigh import weigh
@@ -101,6 +101,19 @@ def test_a_search_for_a_strong_cause_begins_near_it(twin: Twin, reference: list[
     assert first.z == pytest.approx([10.0]) and 0.0 < second.z[0] <= 3.0
     losses = bench.fitted.losses(trial.space, [trial.space.start(), first.z, second.z]).mean(axis=1)
     assert first.promise == pytest.approx(losses[0] - losses[1], rel=1e-6) and losses[1] < losses[2]
+
+
+def test_a_reference_that_was_never_there_says_nothing_of_a_place(
+    twin: Twin, dragged: list[Episode], reference: list[Episode]
+) -> None:
+    """A ball a metre beside the rope changes nothing in the reference: no change is no ball, not that ball."""
+    bench = bench_of(twin, dragged, reference)
+    trial = make_trial(bench.twin, (find_effect("obstacle"),))
+    ball = find_effect("obstacle").extension(radius=(0.05,), center=(1.0, 1.0, 0.5))
+    found, off = coordinates(trial.space, Candidate(bench.twin.physics, (ball,))), trial.space.start()
+    assert found[trial.amplitudes[0]] > off[trial.amplitudes[0]]
+    screened = Screened((find_effect("obstacle"),), trial, [Start(found, 0.0)], 0.0, off)
+    assert null_of(bench, screened, found) == pytest.approx(off)
 
 
 def test_without_a_group_leaves_no_trace_of_it(twin: Twin, dragged: list[Episode], reference: list[Episode]) -> None:

@@ -22,6 +22,7 @@ from pred_core.types import Array
 
 KEPT_STARTS = 4
 ON_THE_WAY, STILL_FALLING = 3, 0.75  # times these steps are taken again, while the loss falls to this share
+HARDLY = 0.02  # of the reference's loss: what a candidate saves there is no reason to take it for what is usual
 QUICK, TRIED = 2, 2  # steps, and starts, of a candidate before it is told whether it goes on
 Tell = Callable[[str], None]
 Effects = tuple[type[Effect], ...]
@@ -110,6 +111,7 @@ def null_of(bench: Bench, screened: Screened, found: Array) -> Array:
 
     What the engine and the object lack in common would otherwise count as a change. The reference is fitted with the
     same budget, from off and from where the suspect set led (`found`): a fit that ended early would look like a change.
+    Where it gains HARDLY anything there, it is off: the reference may never have been where a cause acts.
     """
     trial = screened.trial
     if not bench.config.back_fit:
@@ -122,6 +124,9 @@ def null_of(bench: Bench, screened: Screened, found: Array) -> Array:
         begins.append(other.space.start())
     ends = [fit(bench.reference, other.space, z, bench.config.iterations, most=trial.most) for z in begins]
     best = min(ends, key=lambda f: float(f.loss.mean()))
+    off = float(bench.reference.losses(other.space, [other.space.start()]).mean())
+    if float(best.loss.mean()) > (1.0 - HARDLY) * off:
+        return screened.null
     values = other.space.values(best.z)
     null = screened.null.copy()
     for n, knob in enumerate(trial.space.knobs):
