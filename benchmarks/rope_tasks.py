@@ -23,7 +23,8 @@ import torch
 from reroute import TWINS, about
 from reroute_cell import DrivenCell, go
 from reroute_eyes import TrueEyes
-from reroute_figures import curve, curves
+from reroute_figures import COLORS, curve, curves
+from reroute_scores import sign_test
 from reroute_trial import Trial, TrialConfig, check_twin, open_cell, write_whole
 
 from pred_core.bag.deform import SOURCE_FILE, claim_folder
@@ -124,11 +125,24 @@ def write_tasks(work: Path) -> None:
         print(" | ".join(rows[-1]), f"| to {times[-1]:.1f} s")
     if not groups:
         return
+    print("\n".join(line for task in TASKS if (line := paired_line(task, groups))))
     (work / "tasks.json").write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     page = Page("Four rope tasks")
     page.table(("twin, task", "trials", "begin [mm]", f"after {SOON:g} s [mm]", "end [mm]"), rows)
     page.figure(curves(groups), "Chamfer distance to the goal: each trial, and the median.")
     page.write(work / "tasks.html")
+
+
+def paired_line(task: str, groups: dict[str, list[dict[str, Any]]]) -> str:
+    """In how many of the same starts either twin ends nearer to the goal, and the sign test; empty without both."""
+    ends = [{t["seed"]: t["chamfer"][-1][1] for t in groups.get(f"{twin}-{task}", [])} for twin in COLORS]
+    both = sorted(ends[0].keys() & ends[1].keys())
+    if not both:
+        return ""
+    nearer = [sum(ends[k][s] < ends[1 - k][s] for s in both) for k in (0, 1)]
+    a, b = COLORS
+    p = sign_test(*nearer)
+    return f"{task}: {a} ends nearer in {nearer[0]}, {b} in {nearer[1]} of {len(both)} (sign test p = {p:.2g})"
 
 
 def main() -> int:
