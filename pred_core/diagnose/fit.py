@@ -116,15 +116,15 @@ def fit(
 ) -> Fit:
     """The local optimum near z, on all episodes or on `chosen` (E,) bool.
 
-    Steps to where more than `most` times the twin's substeps are needed, and more than at the start, are not taken:
-    what the data do not show (axial damping) must not make the simulation slow.
+    Steps to where more than `most` times the substeps of the start are needed are not taken: what the data do not
+    show (axial damping) must not make the simulation slow.
     """
     lower, upper = (np.array(b) for b in space.bounds())
     z = np.clip(np.asarray(z, dtype=np.float64), lower, upper)
     origin = z.copy()
     use = np.ones(target.roller.sample.episodes, dtype=bool) if chosen is None else chosen
     damping, longest = 1e-2, LONGEST
-    limit = max(target.roller.demand(space.candidate(z)), most * target.roller.usual())
+    limit = most * max(target.roller.demand(space.candidate(z)), target.roller.usual())
     loss, gradient, curvature, substeps = target.linearize(space, z)
     for _ in range(iterations):
         g = gradient[use].mean(axis=0) + PRIOR * (z - origin)

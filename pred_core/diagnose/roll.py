@@ -25,8 +25,9 @@ FARTHEST = 0.5  # [m] a coordinate's error counts with at most; also where the s
 NEAR = 0.01  # [m]
 MOST_WORLDS = 1536  # in one kernel call
 LADDER = (1.0, 1.15, 1.35, 1.6, 2.0, 2.5, 3.2, 4.0, 6.0, 9.0, 12.0)  # times the twin's substeps: what candidates get
-MOST_FACTOR = 4.0  # a search goes no farther than that
-MOST_LOSS = LADDER[-1]  # nor than that where the candidate is a loss in bending, which acts plainly only there
+MOST_FACTOR = 4.0  # what is stiffer than that is simulated with so many: the bound is far on the safe side
+MOST_LOSS = LADDER[-1]  # the same for a loss in bending, whose bound is nearer
+LOSS = "internal loss"  # family
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,13 @@ class Roller:
     def substeps(self, candidates: Sequence[Candidate]) -> int:
         """One number for all: the most demanding one's, a rung, at least the twin's own, within reason."""
         usual = self.usual()
-        needed = max(self.demand(c) for c in candidates) / usual
-        return math.ceil(usual * next((f for f in LADDER if f >= needed), LADDER[-1]))
+        most = MOST_LOSS if any(map(self._loses_otherwise, candidates)) else MOST_FACTOR
+        needed = min(max(self.demand(c) for c in candidates) / usual, most)
+        return math.ceil(usual * next(f for f in LADDER if f >= needed))
+
+    def _loses_otherwise(self, candidate: Candidate) -> bool:
+        mine = {e.id: e.parameters for e in self.twin.extensions}
+        return any(find_effect(e.id).family == LOSS and mine.get(e.id) != e.parameters for e in candidate.extensions)
 
     def usual(self) -> float:
         """Substeps a period that keep the twin as it is stable."""

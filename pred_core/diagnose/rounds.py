@@ -21,7 +21,7 @@ from pred_core.effects import LIBRARY
 from pred_core.types import Array
 
 GATE_ONLY = ("gripper_offset", "gripper_rotation")  # absorbed by measured starts: the model-free gate names them
-WORTH = 0.02  # of the floor: what a candidate must promise to be fitted to the end
+WORTH = 0.03  # of the floor: what a candidate must promise to be fitted to the end
 SURE = 0.01  # p value of a lack of fit
 FEW, FINALISTS = 2, 5  # candidates that are fitted to the end: at least, and at most
 BEHIND = 0.35  # share of the leader's gain below which the others are not

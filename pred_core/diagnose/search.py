@@ -17,6 +17,7 @@ from pred_core.types import Array
 
 SECANT = 0.7  # typical changes of the switch, over which a first slope is taken
 AHEAD = (1.5, 3.0, 6.0, 10.0)  # [typical changes] how far a start is followed along its direction
+DECIDED = 1.5  # times what the start promises: then the search begins ahead of it only
 NOWHERE = 1e-6  # [typical changes] length of a start that has no direction
 SCANNED = 16  # windows in which places are tried, those with the largest loss: one block of worlds
 
@@ -84,8 +85,10 @@ def starts(target: Target, trial: Trial, count: int, rng: np.random.Generator) -
             continue
         found.append(Start(z, promise))
     found.sort(key=lambda s: -s.promise)
-    farther = [_along(target, trial, s, share) for s in found[: 1 if scanning else None]]
-    found = sorted([*(s for s in farther if s is not None), *found], key=lambda s: -s.promise)
+    ahead = _along(target, trial, found[0], share) if found else None
+    if ahead is not None:
+        decided = not scanning and ahead.promise > DECIDED * found[0].promise
+        found = [ahead] if decided else sorted([ahead, *found], key=lambda s: -s.promise)
     return found or [Start(null, 0.0)]
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pred_core.diagnose.roll import MOST_FACTOR, MOST_LOSS, Roller
+from pred_core.diagnose.roll import LOSS, MOST_FACTOR, MOST_LOSS, Roller
 from pred_core.effects import find_effect
 from pred_core.effects.effect import Effect, Parameter
 from pred_core.identify.space import SearchSpace, search_space
@@ -14,7 +14,6 @@ from pred_core.twin import Extension, Twin
 from pred_core.types import Array
 
 # Effects that are measurement (corrected, not simulated) or too flexible to be a name: they would explain anything.
-LOSS = "internal loss"  # family
 NOT_A_NAME = ("bending_profile", "mass_profile", "rest_curvature")
 
 
