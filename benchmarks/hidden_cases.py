@@ -20,7 +20,7 @@ from pred_core.plant.session import SessionConfig
 SESSION = SessionConfig(train=12, test=4, ood=3, seconds=4.0)
 SETS = ("final", "seen", "dev")
 REFERENCES = (50000, 51000, 52000, 53000)
-SEEN = 29  # cases of the first seen draw that were looked at; of the second all were
+SEEN = (29, 106, 34)  # cases of each seen draw that were looked at
 LEAST, MOST = 2.0, 10.0  # magnitudes, in multiples of the effect's declared minimum, log-uniform
 
 
@@ -82,10 +82,10 @@ def release(which: str) -> Release:
     if which == "dev":
         return _release((7000,), cases(7100, 1, 8, 26, 7, 4))
     if which == "seen":
-        first = _release(REFERENCES, cases(50100, 2, 40, 46, 10, 6)[:SEEN])
-        second = _release(REFERENCES, cases(50200, 3, 42, 48, 10, 6))
-        return Release(first.references, (*first.cases, *second.cases))
-    return _release(REFERENCES, cases(50500, 4, 40, 46, 10, 6))
+        drawn = (cases(50100, 2, 40, 46, 10, 6), cases(50200, 3, 42, 48, 10, 6), cases(50500, 4, 40, 46, 10, 6))
+        parts = [_release(REFERENCES, d[:count]) for d, count in zip(drawn, SEEN, strict=True)]
+        return Release(parts[0].references, tuple(c for p in parts for c in p.cases))
+    return _release(REFERENCES, cases(50700, 5, 40, 46, 10, 6))
 
 
 def simulate(root: Path, hidden: Hidden, seed: int) -> None:

@@ -46,7 +46,7 @@ from hidden_table import ablated, compare, markdown, scores
 import pred_core
 from pred_core.cli.main import BAD_INPUT
 from pred_core.diagnose.config import STEPS
-from pred_core.errors import PredError
+from pred_core.errors import ConfigError, PredError
 from pred_core.plant.case import truth_path
 
 IDENTIFY = shlex.split(
@@ -60,7 +60,11 @@ ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 def main() -> int:
     """Run one of the commands."""
     args = _arguments()
-    return int(args.act(args))
+    try:
+        return int(args.act(args))
+    except ConfigError as error:
+        print(f"hidden_effects: {error}", file=sys.stderr)
+        return BAD_INPUT
 
 
 def _arguments() -> argparse.Namespace:
@@ -98,7 +102,8 @@ def chosen(drawn: Release, only: Sequence[str]) -> list[Case]:
     known = {c.name: c for c in drawn.cases}
     missing = [n for n in only if n not in known]
     if missing:
-        sys.exit(f"no case {', '.join(missing)}: names are {drawn.cases[0].name} to {drawn.cases[-1].name}")
+        allowed = f"{drawn.cases[0].name} to {drawn.cases[-1].name}"
+        raise ConfigError("--only", got=", ".join(missing), allowed=allowed, next_step="Or name another --set")
     return [known[n] for n in only] if only else list(drawn.cases)
 
 
@@ -220,9 +225,16 @@ def _beside(args: argparse.Namespace, cases: Sequence[Case]) -> int:
     """What the command makes of every case that has been diagnosed, as WORK/<command>/<name>.json."""
     os.environ.update(ONE_THREAD)
     what = args.command
+    if not any((args.work / args.out / c.name / "diagnosis.json").exists() for c in cases):
+        raise _nothing(args)
     todo = {c.name: c for c in cases if (args.work / args.out / c.name / "diagnosis.json").exists()
             and not (args.work / what / f"{c.name}.json").exists()}  # fmt: skip
     return 1 if _all(what, list(todo), args.jobs, partial(_one_beside, args, todo)) else 0
+
+
+def _nothing(args: argparse.Namespace) -> ConfigError:
+    where = args.work / args.out
+    return ConfigError(f"no diagnosis in {where}", got=f"--set {args.set}", next_step="Run the cases first")
 
 
 def _one_beside(args: argparse.Namespace, cases: Mapping[str, Case], name: str) -> int:
@@ -259,7 +271,7 @@ def score_cases(args: argparse.Namespace) -> int:
             simple.setdefault(method, []).append(judged(case.name, case.reference, case.hidden, answer, {}, None,
                                                         _json(args.work / "paired" / f"{case.name}.json")))
     if not rows:
-        sys.exit(f"no diagnosis in {args.work / args.out}: run the cases first")
+        raise _nothing(args)
     result = scores(rows, placebos=args.placebos)
     if simple:
         result["baselines"] = compare({"diagnosis": rows, **simple})

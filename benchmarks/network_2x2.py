@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 import json
 import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,8 @@ from measured_cables import pred as run_pred
 
 from pred_core.bag.dataset import Dataset, EpisodeEntry, load_dataset
 from pred_core.bag.measured import measured_or_explain
+from pred_core.cli.main import BAD_INPUT
+from pred_core.errors import ConfigError, PredError
 from pred_core.evaluate.bootstrap import bootstrap_interval
 from pred_core.evaluate.protocol import predict
 from pred_core.evaluate.report import write_json
@@ -84,6 +87,17 @@ def main() -> int:
         kind.add_argument("--steps", type=int, default=steps, help="training steps of each network")
         kind.add_argument("--settings", nargs="+", choices=every, default=[*every], help="to choose from")
     args = parser.parse_args()
+    try:
+        return make_tables(args)
+    except PredError as error:
+        print(f"network_2x2: {error}", file=sys.stderr)
+        return BAD_INPUT
+
+
+def make_tables(args: argparse.Namespace) -> int:
+    """The tables that are asked for, printed and written. Raises: PredError."""
+    if args.kind == "cable" and args.folds not in (0, *range(2, 71)):
+        raise ConfigError("--folds", got=args.folds, allowed="0, or 2 to 70")
     settings = {name: SETTINGS[args.kind][name] for name in args.settings}
     if args.kind == "case":
         setup = Setup(args.dataset, {"base": args.base, "extended": args.extended}, args.out, args.steps)

@@ -22,6 +22,7 @@ import numpy as np
 
 from pred_core.arm.limits import GuardConfig
 from pred_core.cli.main import BAD_INPUT, INTERRUPTED
+from pred_core.config import from_mapping
 from pred_core.errors import ConfigError, PredError
 from pred_core.plan.endpoints import read_cloud
 from pred_core.plan.goal import size_of
@@ -132,7 +133,7 @@ def prepare(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     nodes["planner"].setdefault("settings", str(config_folder() / "plan" / "slot.yaml"))
     nodes["planner"]["seed"] = args.seed
     apply_overrides(nodes, args.overrides)
-    slot = SlotConfig(gap=float(str(nodes["plant"].get("gap", SlotConfig.gap))))
+    slot = from_mapping(SlotConfig, {"gap": nodes["plant"].get("gap", SlotConfig.gap)}, "plant")
     if load_settings(nodes["planner"]["settings"]).slot is not None:
         nodes["planner"].setdefault("gap", slot.gap)
     if not any(o.startswith("tracker.fixtures=") for o in args.overrides):

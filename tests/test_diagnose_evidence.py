@@ -66,7 +66,10 @@ def test_names_go_to_what_leaves_least(twin: Twin) -> None:
     flattered, right = gains(twin, np.array([[2.0, 2.1, 1.9, 2.0], [1.5, 1.6, 1.4, 1.5]]))
     flattered = dataclasses.replace(flattered, extended=np.array([1.0, 1.1, 0.9, 1.0]))
     right = dataclasses.replace(right, extended=np.array([0.8, 0.7, 0.8, 0.9]))
-    assert rivals([flattered, right], right)[0][0] is right and simplest([flattered, right], right) is right
+    assert rivals([flattered, right], right)[0][0] is right
+    plain, flexible = nested(twin, 0.98)  # the gain of the plain one is near, what it leaves is not
+    plain = dataclasses.replace(plain, extended=plain.extended + 1.0)
+    assert simplest([plain, flexible], flexible) is flexible
 
 
 def test_a_local_cause_is_told_from_off_and_not_from_another_place(twin: Twin) -> None:

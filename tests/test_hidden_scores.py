@@ -215,7 +215,7 @@ def test_cases_are_a_function_of_their_seeds(bench: dict[str, ModuleType]) -> No
     tuned, seen = (bench["hidden_cases"].release(name) for name in ("dev", "seen"))
     assert not seeds & ({c.seed for c in tuned.cases} | set(tuned.references.values()))
     looked_at = {c.seed for c in seen.cases}
-    assert looked_at == {*range(50101, 50130), *range(50201, 50307)} and not seeds & looked_at
+    assert looked_at == {*range(50101, 50130), *range(50201, 50307), *range(50501, 50535)} and not seeds & looked_at
     magnitudes = [{m for c in r.cases for n, m in c.hidden if m < HIDDEN[n].high} for r in (drawn, seen, tuned)]
     assert len(magnitudes[0]) > 50 and not magnitudes[0] & (magnitudes[1] | magnitudes[2])  # drawn anew, too
     for case in drawn.cases:
@@ -243,17 +243,17 @@ def test_runs_go_on_and_say_what_failed(
 
     monkeypatch.setattr(effects, "_pred", pred)
     monkeypatch.setattr(effects, "simulate", lambda root, hidden, seed: None)
-    done = tmp_path / "out" / "case50501"
+    done = tmp_path / "out" / "case50701"
     done.mkdir(parents=True)
     (done / "diagnosis.json").write_text("{}")
-    words = ["x", "run", "--work", str(tmp_path), "--jobs", "1", "--only", "case50501", "case50502"]
+    words = ["x", "run", "--work", str(tmp_path), "--jobs", "1", "--only", "case50701", "case50702"]
     monkeypatch.setattr(sys, "argv", words)
     assert effects.main() == 1
     assert effects.main() == 1
     said = capsys.readouterr().out
-    assert "case50502 failed with code 2" in said and "1 of 2 cases are there" in said
+    assert "case50702 failed with code 2" in said and "1 of 2 cases are there" in said
     twins = [f"identify {c.reference}" for c in drawn.cases[:2]]
-    assert calls.read_text().splitlines() == [*twins, *["diagnose case50502"] * 2]
+    assert calls.read_text().splitlines() == [*twins, *["diagnose case50702"] * 2]
 
 
 def test_scores_are_written_and_foreign_truths_refused(

@@ -27,7 +27,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     worlds = parser.add_subparsers(dest="world", required=True, metavar="WORLD")
     rope = worlds.add_parser("rope", help="a MuJoCo rope in the air and on a table")
     rope.add_argument("--effect", action="append", metavar="NAME", help="what is hidden; may be given twice; or none")
-    rope.add_argument("--magnitude", action="append", type=float, metavar="M", help="one an effect, in its unit")
+    about = "one an effect, in its unit; without, its least"
+    rope.add_argument("--magnitude", action="append", type=float, metavar="M", help=about)
     springs = worlds.add_parser("springs", help="springs like those of our simulator, finer: nothing is hidden")
     for world in (rope, springs):
         world.add_argument("--seed", type=int, default=0, help="motions, noise, directions and places")

@@ -24,7 +24,7 @@ from pred_core.twin import Twin
 from pred_core.types import Episode
 
 MOST_LEFT_OUT = 0.2  # of the episodes
-SLOWER = 2.0  # times a round before; where one would be, the time it needs is counted before it begins
+SLOWER = 2.0  # times the substeps of the round before, from which the time of a round is estimated before it begins
 LATEST = 0.8  # share of the time after which no further round begins; the errors and the report take the rest
 
 

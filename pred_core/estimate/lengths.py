@@ -44,7 +44,7 @@ class Lengths:
     def keep(self, before: Array, after: Array) -> Array:
         """`after` (N, 3) [m], moved so that its springs are as long as in `before`, or nearer to it than they were."""
         length = np.linalg.norm(before[self._j] - before[self._i], axis=1)
-        x = best = after
+        x = best = after.copy()
         along, growth = self._stretch(x, length)
         least = float(np.linalg.norm(growth))
         for _ in range(STEPS):
