@@ -10,6 +10,7 @@ from report_cases import judged, rope
 
 from pred_core.diagnose import evidence
 from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals, set_limit, simplest
+from pred_core.diagnose.progress import Named, refitted
 from pred_core.diagnose.trial import make_trial
 from pred_core.effects import find_effect
 from pred_core.twin import Twin
@@ -70,6 +71,16 @@ def test_names_go_to_what_leaves_least(twin: Twin) -> None:
     plain, flexible = nested(twin, 0.98)  # the gain of the plain one is near, what it leaves is not
     plain = dataclasses.replace(plain, extended=plain.extended + 1.0)
     assert simplest([plain, flexible], flexible) is flexible
+
+
+def test_an_interval_gets_no_shorter_beside_a_later_cause(twin: Twin) -> None:
+    """Drag 1.5 [1.2, 1.8], then 1.6 [1.59, 1.61] fitted beside a later cause: 1.6 [1.3, 1.9]. A wide one stays wide."""
+    first, knob = judged(twin, "drag_linear", 1.5, 0.6, [1.0] * 10), "drag_linear.coefficient[0]"
+    named = Named(first, 0.01, (), 1.0, 0)
+    for width, expected in ((0.02, (1.3, 1.9)), (1.0, (1.1, 2.1))):
+        later = judged(twin, "drag_linear", 1.6, width, [1.0] * 10)
+        found = refitted(named, later).judged
+        assert found.values[knob] == 1.6 and found.intervals[knob] == pytest.approx(expected)
 
 
 def test_a_local_cause_is_told_from_off_and_not_from_another_place(twin: Twin) -> None:

@@ -52,7 +52,7 @@ class Progress:
 
     def add(self, named: Named, bench: Bench) -> None:
         """Take a name, and the bench that has it."""
-        self.named = [_refitted(n, named.judged) for n in self.named]
+        self.named = [refitted(n, named.judged) for n in self.named]
         self.named.append(named)
         self.bench = bench
         self.twins.append(bench.twin)
@@ -69,13 +69,17 @@ class Progress:
         return time.monotonic() + needs > self.deadline
 
 
-def _refitted(named: Named, later: Judged) -> Named:
-    """An earlier name with the values it has beside a later one: they were fitted together."""
+def refitted(named: Named, later: Judged) -> Named:
+    """An earlier name with the values it has beside a later one: they were fitted together. Its intervals move with
+    them and get no shorter: for the later one the earlier is no change, so only the scatter over recordings is in its.
+    """
     j = named.judged
     mine = set(j.values) & set(later.values)
-    judged = dataclasses.replace(
-        j,
-        values={**j.values, **{k: later.values[k] for k in mine}},
-        intervals={**j.intervals, **{k: later.intervals[k] for k in mine}},
-    )
+    intervals = dict(j.intervals)
+    for k in mine:
+        value, (low, high), (least, most) = later.values[k], j.intervals[k], later.intervals[k]
+        knob = next(q for q in later.trial.space.knobs if q.name == k)
+        low, high = min(value + low - j.values[k], least), max(value + high - j.values[k], most)
+        intervals[k] = (max(low, knob.low), min(high, knob.high))
+    judged = dataclasses.replace(j, values={**j.values, **{k: later.values[k] for k in mine}}, intervals=intervals)
     return dataclasses.replace(named, judged=judged)
