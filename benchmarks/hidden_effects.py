@@ -81,13 +81,15 @@ def _arguments() -> argparse.Namespace:
     least.set_defaults(act=run_oracle)
     simple = commands.add_parser("baselines", help="answers of simpler ways")
     simple.set_defaults(act=run_baselines)
+    alike = commands.add_parser("flips", help="what sign flips of recordings and of episodes say of the controls")
+    alike.set_defaults(act=run_flips)
     plain = commands.add_parser("paired", help="errors of the base on the same motions with nothing hidden")
     plain.set_defaults(act=run_paired)
     for command in (run, less, least, simple, plain):
         command.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at once")
     for command in (run, score):
         command.add_argument("--placebos", action="store_true", help="with laws that nothing obeys")
-    for command in (run, less, score, least, simple, plain):
+    for command in (run, less, score, least, simple, plain, alike):
         command.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these cases")
         command.add_argument("--work", type=Path, required=True, metavar="DIR", help="where everything stands")
         command.add_argument("--out", default="", help="folder of the answers in the work folder (out)")
@@ -116,11 +118,11 @@ def run_cases(args: argparse.Namespace) -> int:
         "twin", sorted(r for r in references if not (_twin(args.work, r) / "twin.yaml").exists()), args.jobs,
         partial(_identify, args.work, drawn.references),
     )  # fmt: skip
-    todo = {c.name: c for c in cases if not (args.work / args.out / c.name / "diagnosis.json").exists()}
-    print(f"{len(cases) - len(todo)} of {len(cases)} cases are there", flush=True)
-    ready = [n for n, c in todo.items() if c.reference not in failed]
-    failed += _all("case", ready, args.jobs, partial(_diagnose, args, todo))
-    return 1 if failed or len(ready) < len(todo) else 0
+    missing_cases = {c.name: c for c in cases if not (args.work / args.out / c.name / "diagnosis.json").exists()}
+    print(f"{len(cases) - len(missing_cases)} of {len(cases)} cases are there", flush=True)
+    ready = [n for n, c in missing_cases.items() if c.reference not in failed]
+    failed += _all("case", ready, args.jobs, partial(_diagnose, args, missing_cases))
+    return 1 if failed or len(ready) < len(missing_cases) else 0
 
 
 def run_ablations(args: argparse.Namespace) -> int:
@@ -221,15 +223,27 @@ def run_paired(args: argparse.Namespace) -> int:
     return _beside(args, [c for c in chosen(release(args.set), args.only) if c.hidden])
 
 
+def run_flips(args: argparse.Namespace) -> int:
+    """Print, for every control, the smallest p value of its first round, and how alike gains of a recording are."""
+    from hidden_flips import flips
+
+    controls = [c for c in chosen(release(args.set), args.only) if not c.hidden]
+    done = [c for c in controls if (args.work / args.out / c.name / "diagnosis.json").exists()]
+    if not done:
+        raise _nothing(args)
+    print("\n".join(flips([(args.work / c.name, args.work / args.out / c.name) for c in done])))
+    return 0
+
+
 def _beside(args: argparse.Namespace, cases: Sequence[Case]) -> int:
     """What the command makes of every case that has been diagnosed, as WORK/<command>/<name>.json."""
     os.environ.update(ONE_THREAD)
     what = args.command
     if not any((args.work / args.out / c.name / "diagnosis.json").exists() for c in cases):
         raise _nothing(args)
-    todo = {c.name: c for c in cases if (args.work / args.out / c.name / "diagnosis.json").exists()
+    missing_cases = {c.name: c for c in cases if (args.work / args.out / c.name / "diagnosis.json").exists()
             and not (args.work / what / f"{c.name}.json").exists()}  # fmt: skip
-    return 1 if _all(what, list(todo), args.jobs, partial(_one_beside, args, todo)) else 0
+    return 1 if _all(what, list(missing_cases), args.jobs, partial(_one_beside, args, missing_cases)) else 0
 
 
 def _nothing(args: argparse.Namespace) -> ConfigError:

@@ -119,17 +119,17 @@ def run_trials(args: argparse.Namespace) -> int:
     if args.trials < 1 or args.first < 0 or args.jobs < 1:
         raise ConfigError("--trials, --first, --jobs", got=f"{args.trials} {args.first} {args.jobs}",
                           allowed="1 or more, 0 or more, 1 or more")  # fmt: skip
-    todo = []
+    left = []
     for seed in range(args.first, args.first + args.trials):
         for name in args.twin or TWINS:
             folder = trial_folder(args.work, name, config)
             claim_folder(folder, about(args.work / name, args.settings, config))
             path = folder / f"{seed}.json"
             if not path.exists():
-                todo.append((args.work / name, args.settings, config, seed, path, args.work / "goals"))
+                left.append((args.work / name, args.settings, config, seed, path, args.work / "goals"))
     failed = 0
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
-        for job in as_completed([pool.submit(_trial, *one) for one in todo]):
+        for job in as_completed([pool.submit(_trial, *one) for one in left]):
             line, good = job.result()
             failed += not good
             print(line, flush=True)

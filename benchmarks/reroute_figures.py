@@ -33,11 +33,18 @@ def settings_of(groups: dict[str, Any]) -> dict[str, list[str]]:
     return found
 
 
+def panels(groups: dict[str, Any], height: float) -> tuple[Figure, list[tuple[Any, str, list[str]]]]:
+    """A figure `height` inches high, and of each of its panels axes, what it shows and the folders of it."""
+    settings = settings_of(groups)
+    figure = Figure(figsize=(5.5 * len(settings), height), layout="constrained")
+    row = figure.subplots(1, len(settings), squeeze=False)[0]
+    return figure, [(axes, title, names) for axes, (title, names) in zip(row, settings.items(), strict=True)]
+
+
 def shares(groups: dict[str, list[dict[str, Any]]]) -> Figure:
     """Through by when; one panel for what differs beside the twin."""
-    panels = settings_of(groups)
-    figure = Figure(figsize=(5.5 * len(panels), 3.0), layout="constrained")
-    for axes, (title, names) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+    figure, parts = panels(groups, 3.0)
+    for axes, title, names in parts:
         for name in names:
             longest = max(t["chamfer"][-1][0] for t in groups[name])
             times = sorted(t["time"] for t in groups[name] if t["success"])
@@ -52,9 +59,8 @@ def shares(groups: dict[str, list[dict[str, Any]]]) -> Figure:
 
 def curves(groups: dict[str, list[dict[str, Any]]]) -> Figure:
     """One panel for what differs beside the twin."""
-    panels = settings_of(groups)
-    figure = Figure(figsize=(5.5 * len(panels), 3.6), layout="constrained")
-    for axes, (title, names) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+    figure, parts = panels(groups, 3.6)
+    for axes, title, names in parts:
         for name in names:
             color = COLORS.get(_twin(name), OTHER)
             for trial in groups[name]:

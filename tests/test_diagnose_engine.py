@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from bag_examples import line_episode
+from diagnose_cases import SMALL, SPLITS, bench_of, drag_trial, quiet
 from report_cases import PERIOD, answer, drag, judged, recorded, rope, with_errors
 
 from pred_core.diagnose.commission import commission, values_of
@@ -19,7 +19,7 @@ from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.fit import Fit, fit, rho, without_groups
 from pred_core.diagnose.journal import Journal
-from pred_core.diagnose.judge import Bench, Screened, judge, null_of, screen
+from pred_core.diagnose.judge import judge, screen
 from pred_core.diagnose.naming import exploratory, one_recording, why_not
 from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.roll import Roller
@@ -27,9 +27,8 @@ from pred_core.diagnose.rounds import finish
 from pred_core.diagnose.run import diagnose, moved_markers
 from pred_core.diagnose.said import sentence
 from pred_core.diagnose.sample import Sample, make_sample
-from pred_core.diagnose.search import Start, coordinates, starts
 from pred_core.diagnose.skill import skill_of
-from pred_core.diagnose.trial import Trial, make_trial
+from pred_core.diagnose.trial import make_trial
 from pred_core.diagnose.weigh import weigh
 from pred_core.effects import find_effect
 from pred_core.errors import DatasetError
@@ -37,13 +36,6 @@ from pred_core.identify.space import Candidate
 from pred_core.springmass import SpringMass
 from pred_core.twin import Extension, Twin
 from pred_core.types import Episode, Grip, State
-
-SPLITS = ("train",) * 5 + ("test",)
-SMALL = DiagnoseConfig(places=4, survivors=3, iterations=6)
-
-
-def quiet(_: str) -> None:
-    """No progress."""
 
 
 @pytest.fixture(scope="module")
@@ -59,14 +51,6 @@ def reference(twin: Twin) -> list[Episode]:
 @pytest.fixture(scope="module")
 def dragged(twin: Twin) -> list[Episode]:
     return recorded(twin, drag(), SPLITS, seed=0, frames=40)
-
-
-def bench_of(twin: Twin, suspect: Sequence[Episode], reference: Sequence[Episode]) -> Bench:
-    return commission(twin, suspect, reference, SMALL, quiet, Journal(None, {}))
-
-
-def drag_trial(bench: Bench) -> Trial:
-    return make_trial(bench.twin, (find_effect("drag_linear"),))
 
 
 # Fits -----------------------------------------------------------------------------------------------------------------
@@ -89,32 +73,6 @@ def test_planted_drag_is_recovered(twin: Twin, dragged: list[Episode], reference
     assert space.values(result.z)["drag_linear.coefficient[0]"] == pytest.approx(1.5, rel=0.02)
     before = bench.fitted.losses(space, [space.start()])[0]
     assert (result.loss < 0.2 * before).all()  # 5.8 to noise, whose mean loss is about 0.35
-
-
-def test_a_search_for_a_strong_cause_begins_near_it(twin: Twin, reference: list[Episode]) -> None:
-    """Drag of 6 /s is 12 typical changes. A straight line from "off" goes three at most; followed while the loss falls
-    it comes to ten. What it promises there is what is saved there, and much more than three save.
-    """
-    bench = bench_of(twin, recorded(twin, drag(coefficient=6.0), SPLITS, seed=0, frames=40), reference)
-    trial = drag_trial(bench)
-    (begin,) = starts(bench.fitted, trial, SMALL.places, np.random.default_rng(0))
-    assert begin.z == pytest.approx([10.0])
-    losses = bench.fitted.losses(trial.space, [trial.space.start(), begin.z, np.array([3.0])]).mean(axis=1)
-    assert begin.promise == pytest.approx(losses[0] - losses[1], rel=1e-6)
-    assert begin.promise > 1.5 * (losses[0] - losses[2])
-
-
-def test_a_reference_that_was_never_there_says_nothing_of_a_place(
-    twin: Twin, dragged: list[Episode], reference: list[Episode]
-) -> None:
-    """A ball a metre beside the rope changes nothing in the reference: no change is no ball, not that ball."""
-    bench = bench_of(twin, dragged, reference)
-    trial = make_trial(bench.twin, (find_effect("obstacle"),))
-    ball = find_effect("obstacle").extension(radius=(0.05,), center=(1.0, 1.0, 0.5))
-    found, off = coordinates(trial.space, Candidate(bench.twin.physics, (ball,))), trial.space.start()
-    assert found[trial.amplitudes[0]] > off[trial.amplitudes[0]]
-    screened = Screened((find_effect("obstacle"),), trial, [Start(found, 0.0)], 0.0, off)
-    assert null_of(bench, screened, found) == pytest.approx(off)
 
 
 def test_without_a_group_leaves_no_trace_of_it(twin: Twin, dragged: list[Episode], reference: list[Episode]) -> None:

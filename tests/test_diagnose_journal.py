@@ -8,23 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnose_cases import SMALL, SPLITS, quiet
 from report_cases import recorded, rope
 
 from pred_core.diagnose.commission import commission, values_of
-from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import judge, quick, screen
 from pred_core.effects import find_effect
 from pred_core.errors import ConfigError
 from pred_core.twin import Twin
 from pred_core.types import Episode
-
-SPLITS = ("train",) * 5 + ("test",)
-SMALL = DiagnoseConfig(places=4, survivors=3, iterations=6)
-
-
-def quiet(_: str) -> None:
-    """No progress."""
 
 
 @pytest.fixture(scope="module")
