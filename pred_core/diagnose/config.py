@@ -20,7 +20,7 @@ class DiagnoseConfig:
     cold_gate: float = setting(0.25, low=0.0, high=1.0, doc="the same without a reference")
     improved: float = setting(0.75, low=0.0, high=1.0, doc="least share of the episodes it acts in that improve")
     enough: float = setting(
-        0.6, low=0.0, high=1.0, doc="share of the excess closed below which pairs are tried; if cold, what is left is unknown"
+        0.6, low=0.0, high=1.0, doc="share of the excess closed below which pairs are tried; cold: the rest is unknown"
     )
     survivors: int = setting(8, low=2, high=100, doc="candidates of the screening that are fitted to the end")
     places: int = setting(32, low=4, high=1000, doc="places, or the like, where a localized cause is tried first")
