@@ -9,7 +9,7 @@
     ... oracle --work out/hidden          ... baselines --work out/hidden
         what could be avoided at most, and what simpler ways would have answered: `score` then shows them too
     ... ablate --work out/hidden
-        the diagnoses again, each without one step (answers in WORK/out_no_<step>): `score` then compares them
+        the diagnoses that are there again, each without one step (in WORK/out_no_<step>): `score` then compares them
     ... run --placebos    ... score --placebos
         six laws that nothing obeys among the candidates; answers in WORK/out_placebos
     ... --set dev
@@ -36,18 +36,17 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from hidden_bench import pieces
 from hidden_cases import SETS, Case, Release, release, simulate
 from hidden_scores import Judgement, judged
 from hidden_table import ablated, compare, markdown, scores
+from hidden_work import ANSWER, CODE, TWIN, check_data, check_truth, code_of, diagnosed, read_json, twin_of
 
 import pred_core
 from pred_core.cli.main import BAD_INPUT
 from pred_core.diagnose.config import STEPS
 from pred_core.errors import ConfigError, PredError
-from pred_core.plant.case import truth_path
 
 IDENTIFY = shlex.split(
     "--parameters stiffness,damping,ground_friction,bending_stiffness --effects bending_damping --restarts 2"
@@ -62,7 +61,7 @@ def main() -> int:
     args = _arguments()
     try:
         return int(args.act(args))
-    except ConfigError as error:
+    except PredError as error:
         print(f"hidden_effects: {error}", file=sys.stderr)
         return BAD_INPUT
 
@@ -115,10 +114,10 @@ def run_cases(args: argparse.Namespace) -> int:
     cases = chosen(drawn, args.only)
     references = {c.reference for c in cases}
     failed = _all(
-        "twin", sorted(r for r in references if not (_twin(args.work, r) / "twin.yaml").exists()), args.jobs,
+        "twin", sorted(r for r in references if not (twin_of(args.work, r) / TWIN).exists()), args.jobs,
         partial(_identify, args.work, drawn.references),
     )  # fmt: skip
-    missing_cases = {c.name: c for c in cases if not (args.work / args.out / c.name / "diagnosis.json").exists()}
+    missing_cases = {c.name: c for c in cases if not (args.work / args.out / c.name / ANSWER).exists()}
     print(f"{len(cases) - len(missing_cases)} of {len(cases)} cases are there", flush=True)
     ready = [n for n, c in missing_cases.items() if c.reference not in failed]
     failed += _all("case", ready, args.jobs, partial(_diagnose, args, missing_cases))
@@ -126,12 +125,16 @@ def run_cases(args: argparse.Namespace) -> int:
 
 
 def run_ablations(args: argparse.Namespace) -> int:
-    """The cases without each step in turn. Returns 1 if something failed."""
+    """The cases that were diagnosed, without each step in turn. Returns 1 if something failed."""
+    cases = diagnosed(args.work, args.out, chosen(release(args.set), args.only))
+    check_data(args.work, cases)
+    only = [c.name for c in cases]
     failed = 0
     for step in STEPS:
         print(f"without {step}", flush=True)
+        flags = f"--no-{step.replace('_', '-')}"
         less = argparse.Namespace(
-            **{**vars(args), "out": without(step), "flags": f"--no-{step.replace('_', '-')}", "placebos": False}
+            **{**vars(args), "only": only, "out": without(step), "flags": flags, "placebos": False}
         )
         failed |= run_cases(less)
     return failed
@@ -142,13 +145,9 @@ def without(step: str) -> str:
     return f"out_no_{step}"
 
 
-def _twin(work: Path, reference: str) -> Path:
-    return work / "twins" / reference
-
-
 def _identify(work: Path, seeds: Mapping[str, int], name: str) -> int:
     simulate(work / name, (), seeds[name])
-    twin = _twin(work, name)
+    twin = twin_of(work, name)
     return _pred(["identify", str(work / name), "--out", str(twin), *IDENTIFY], twin.parent / f"{name}.log")
 
 
@@ -156,9 +155,9 @@ def _diagnose(args: argparse.Namespace, cases: Mapping[str, Case], name: str) ->
     case, work, out = cases[name], args.work, args.work / args.out / name
     simulate(work / case.name, case.hidden, case.seed)
     out.mkdir(parents=True, exist_ok=True)
-    (out / "code.txt").write_text(_code() + "\n", encoding="utf-8")
+    (out / CODE).write_text(_code() + "\n", encoding="utf-8")
     program = [str(HERE / "hidden_placebos.py")] if args.placebos else PRED
-    words = ["diagnose", str(work / case.name), "--twin", str(_twin(work, case.reference)), "--reference",
+    words = ["diagnose", str(work / case.name), "--twin", str(twin_of(work, case.reference)), "--reference",
              str(work / case.reference), "--out", str(out), *shlex.split(args.flags)]  # fmt: skip
     return _pred(words, work / args.out / f"{case.name}.log", program)
 
@@ -228,9 +227,8 @@ def run_flips(args: argparse.Namespace) -> int:
     from hidden_flips import flips
 
     controls = [c for c in chosen(release(args.set), args.only) if not c.hidden]
-    done = [c for c in controls if (args.work / args.out / c.name / "diagnosis.json").exists()]
-    if not done:
-        raise _nothing(args)
+    done = diagnosed(args.work, args.out, controls)
+    check_data(args.work, done)
     print("\n".join(flips([(args.work / c.name, args.work / args.out / c.name) for c in done])))
     return 0
 
@@ -239,16 +237,10 @@ def _beside(args: argparse.Namespace, cases: Sequence[Case]) -> int:
     """What the command makes of every case that has been diagnosed, as WORK/<command>/<name>.json."""
     os.environ.update(ONE_THREAD)
     what = args.command
-    if not any((args.work / args.out / c.name / "diagnosis.json").exists() for c in cases):
-        raise _nothing(args)
-    missing_cases = {c.name: c for c in cases if (args.work / args.out / c.name / "diagnosis.json").exists()
-            and not (args.work / what / f"{c.name}.json").exists()}  # fmt: skip
+    done = diagnosed(args.work, args.out, cases)
+    missing_cases = {c.name: c for c in done if not (args.work / what / f"{c.name}.json").exists()}
+    check_data(args.work, list(missing_cases.values()))
     return 1 if _all(what, list(missing_cases), args.jobs, partial(_one_beside, args, missing_cases)) else 0
-
-
-def _nothing(args: argparse.Namespace) -> ConfigError:
-    where = args.work / args.out
-    return ConfigError(f"no diagnosis in {where}", got=f"--set {args.set}", next_step="Run the cases first")
 
 
 def _one_beside(args: argparse.Namespace, cases: Mapping[str, Case], name: str) -> int:
@@ -257,7 +249,7 @@ def _one_beside(args: argparse.Namespace, cases: Mapping[str, Case], name: str) 
     torch.set_num_threads(1)
     case, work = cases[name], args.work
     make = getattr(importlib.import_module(f"hidden_{args.command}"), args.command)
-    result = make(case, work, _twin(work, case.reference), work / args.out / name)
+    result = make(case, work, twin_of(work, case.reference), work / args.out / name)
     path = work / args.command / f"{name}.json"
     path.parent.mkdir(exist_ok=True)
     part = path.with_suffix(".part")
@@ -268,30 +260,25 @@ def _one_beside(args: argparse.Namespace, cases: Mapping[str, Case], name: str) 
 
 def score_cases(args: argparse.Namespace) -> int:
     """The table of what has been diagnosed."""
-    drawn = release(args.set)
     rows: list[Judgement] = []
     simple: dict[str, list[Judgement]] = {}
-    missing, codes = [], set()
-    cases = chosen(drawn, args.only)
-    for case in cases:
-        row = _judged(args.work, args.out, case)
-        if row is None:
-            missing.append(case.name)
-            continue
-        _check_truth(args.work, case)
-        codes.add(_code_of(args.work, args.out, case))
-        rows.append(row)
-        for method, answer in (_json(args.work / "baselines" / f"{case.name}.json") or {}).items():
-            simple.setdefault(method, []).append(judged(case.name, case.reference, case.hidden, answer, {}, None,
-                                                        _json(args.work / "paired" / f"{case.name}.json")))
-    if not rows:
-        raise _nothing(args)
+    cases = chosen(release(args.set), args.only)
+    done = diagnosed(args.work, args.out, cases)
+    missing = [c.name for c in cases if c not in done]
+    codes = {code_of(args.work, args.out, c) for c in done}
+    for case in done:
+        check_truth(args.work, case)
+        rows += [row] if (row := _judged(args.work, args.out, case)) else []
+        paired = read_json(args.work / "paired" / f"{case.name}.json")
+        for method, answer in (read_json(args.work / "baselines" / f"{case.name}.json") or {}).items():
+            row = judged(case.name, case.reference, case.hidden, answer, {}, None, paired)
+            simple.setdefault(method, []).append(row)
     result = scores(rows, placebos=args.placebos)
     if simple:
         result["baselines"] = compare({"diagnosis": rows, **simple})
     less = {step: [_judged(args.work, without(step), case) for case in cases] for step in STEPS}
     if any(row for found in less.values() for row in found):
-        codes |= {_code_of(args.work, without(s), c) for s in STEPS for c, r in zip(cases, less[s], strict=True) if r}
+        codes |= {code_of(args.work, without(s), c) for s in STEPS for c, r in zip(cases, less[s], strict=True) if r}
         result["ablations"] = ablated(rows, {s: [r for r in found if r] for s, found in less.items() if any(found)})
     print(markdown(result))
     print(f"\n{len(rows)} cases scored, {len(missing)} without an answer{': ' + ', '.join(missing) if missing else ''};"
@@ -303,28 +290,11 @@ def score_cases(args: argparse.Namespace) -> int:
 def _judged(work: Path, out: str, case: Case) -> Judgement | None:
     """What an answer is worth; None: it is not there."""
     answer = work / out / case.name
-    said = _json(answer / "diagnosis.json")
+    said = read_json(answer / ANSWER)
     if said is None:
         return None
-    beside = {what: _json(work / what / f"{case.name}.json") for what in ("oracle", "paired")}
+    beside = {what: read_json(work / what / f"{case.name}.json") for what in ("oracle", "paired")}
     return judged(case.name, case.reference, case.hidden, said, base=_base(answer), **beside)
-
-
-def _code_of(work: Path, out: str, case: Case) -> str:
-    path = work / out / case.name / "code.txt"
-    return path.read_text(encoding="utf-8") if path.exists() else ""
-
-
-def _json(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
-
-
-def _check_truth(work: Path, case: Case) -> None:
-    """Stop if the truth beside a data set is not what was drawn."""
-    truth = _json(truth_path(work / case.name))
-    hidden = tuple((h["effect"], float(h["magnitude"])) for h in truth["hidden"])
-    if hidden != case.hidden or truth["seed"] != case.seed:
-        sys.exit(f"{case.name}: the truth beside it is of another case; use another work folder")
 
 
 def _base(answer: Path) -> dict[str, float]:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -13,43 +10,15 @@ import numpy as np
 import pytest
 import torch
 from bench_modules import loaded_modules
+from hidden_answers import MODULES, answer
 
 from pred_core.effects import LIBRARY, find_effect
 from pred_core.plant.hidden.library import LIBRARY as HIDDEN
-
-FOLDER = Path(__file__).parents[1] / "benchmarks"
-MODULES = ("hidden_cases", "hidden_scores", "hidden_table", "hidden_bench", "hidden_sindy", "hidden_placebos",
-           "hidden_effects")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def bench() -> Iterator[dict[str, ModuleType]]:
     yield from loaded_modules(MODULES)
-
-
-def answer(
-    outcome: str,
-    *causes: tuple[str, dict[str, tuple[float, float, float]]],
-    group: Sequence[str] = (),
-    base: float = 10.0,
-    extended: float = 8.0,
-    ranking: Sequence[tuple[str, float]] = (),
-) -> dict[str, Any]:
-    """A made-up diagnosis.json; parameters as (value, low, high)."""
-    return {
-        "outcome": outcome,
-        "causes": [
-            {
-                "id": id, "family": find_effect(id).family, "probability": 0.9, "kind": "physics", "group": list(group),
-                "parameters": {k: dict(zip(("value", "low", "high"), v, strict=True)) for k, v in values.items()},
-            }
-            for id, values in causes
-        ],
-        "ranking": [{"id": i, "probability": p} for i, p in ranking],
-        "error_mm": {"base": base, "extended": extended, "floor": 7.0},
-        "error_mm_ood": {"base": 2 * base, "extended": 2 * extended},
-        "seconds": 100.0,
-    }  # fmt: skip
 
 
 def judge(bench: dict[str, ModuleType], hidden: Sequence[tuple[str, float]], said: dict[str, Any], **more: Any) -> Any:
@@ -222,93 +191,6 @@ def test_cases_are_a_function_of_their_seeds(bench: dict[str, ModuleType]) -> No
         for name, magnitude in case.hidden:
             entry = HIDDEN[name]
             assert min(2 * entry.minimum, entry.high) <= magnitude <= min(10 * entry.minimum, entry.high)
-
-
-def test_runs_go_on_and_say_what_failed(
-    bench: dict[str, ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Two cases, one already diagnosed, the other fails: nothing is done twice and the exit code says so."""
-    effects = bench["hidden_effects"]
-    drawn = bench["hidden_cases"].release("final")
-    calls = tmp_path / "calls"
-
-    def pred(words: Sequence[str], log: Path, program: Sequence[str] = ()) -> int:
-        with calls.open("a") as stream:
-            stream.write(f"{words[0]} {Path(words[1]).name}\n")
-        if words[0] == "identify":
-            twin = Path(words[words.index("--out") + 1])
-            twin.mkdir(parents=True)
-            (twin / "twin.yaml").touch()
-        return 0 if words[0] == "identify" else 2
-
-    monkeypatch.setattr(effects, "_pred", pred)
-    monkeypatch.setattr(effects, "simulate", lambda root, hidden, seed: None)
-    done = tmp_path / "out" / "case50701"
-    done.mkdir(parents=True)
-    (done / "diagnosis.json").write_text("{}")
-    words = ["x", "run", "--work", str(tmp_path), "--jobs", "1", "--only", "case50701", "case50702"]
-    monkeypatch.setattr(sys, "argv", words)
-    assert effects.main() == 1
-    assert effects.main() == 1
-    said = capsys.readouterr().out
-    assert "case50702 failed with code 2" in said and "1 of 2 cases are there" in said
-    twins = [f"identify {c.reference}" for c in drawn.cases[:2]]
-    assert calls.read_text().splitlines() == [*twins, *["diagnose case50702"] * 2]
-
-
-def test_scores_are_written_and_foreign_truths_refused(
-    bench: dict[str, ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    case = next(c for c in bench["hidden_cases"].release("final").cases if not c.hidden)
-    out = tmp_path / "out" / case.name
-    out.mkdir(parents=True)
-    (out / "diagnosis.json").write_text(json.dumps(answer("none", ranking=[("none", 0.9)])))
-    truth = tmp_path / f"{case.name}.truth.json"
-    truth.write_text(json.dumps({"hidden": [], "seed": case.seed}))
-    monkeypatch.setattr(sys, "argv", ["x", "score", "--work", str(tmp_path), "--only", case.name])
-    assert bench["hidden_effects"].main() == 0
-    assert "0/1 = 0 % [0.0 to 97.5]" in capsys.readouterr().out
-    assert json.loads((tmp_path / "out" / "scores.json").read_text())["confusion"] == {"none": {"none": 1}}
-    truth.write_text(json.dumps({"hidden": [], "seed": case.seed + 1}))
-    with pytest.raises(SystemExit, match="of another case"):
-        bench["hidden_effects"].main()
-
-
-def test_each_step_is_left_out_in_turn_and_compared_on_the_same_cases(
-    bench: dict[str, ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Two controls. With all steps both are none; without cross-fitting the one that it answered is a false alarm."""
-    effects = bench["hidden_effects"]
-    controls = [c for c in bench["hidden_cases"].release("final").cases if not c.hidden][:2]
-    calls = []
-
-    def pred(words: Sequence[str], log: Path, program: Sequence[str] = ()) -> int:
-        calls.append(words)
-        return 0
-
-    monkeypatch.setattr(effects, "_pred", pred)
-    monkeypatch.setattr(effects, "_all", lambda what, names, jobs, do: [n for n in names if do(n)])
-    monkeypatch.setattr(effects, "simulate", lambda root, hidden, seed: None)
-    one = controls[0].name
-    monkeypatch.setattr(sys, "argv", ["x", "ablate", "--work", str(tmp_path), "--only", one])
-    assert effects.main() == 0
-    diagnosed = [words for words in calls if words[0] == "diagnose"]
-    steps = ("settle", "back_fit", "cross_fit", "chaos_weights")
-    assert [Path(w[w.index("--out") + 1]).parent.name for w in diagnosed] == [f"out_no_{s}" for s in steps]
-    assert [w[-1] for w in diagnosed] == ["--no-settle", "--no-back-fit", "--no-cross-fit", "--no-chaos-weights"]
-    named = answer("named", ("drag_linear", {"coefficient": (1.0, 0.5, 1.5)}), ranking=[("drag_linear", 0.9)])
-    none = answer("none", ranking=[("none", 0.9)])
-    for case in controls:
-        (tmp_path / f"{case.name}.truth.json").write_text(json.dumps({"hidden": [], "seed": case.seed}))
-    for out, name, said in (("out", one, none), ("out", controls[1].name, none), ("out_no_cross_fit", one, named)):
-        (tmp_path / out / name).mkdir(parents=True, exist_ok=True)
-        (tmp_path / out / name / "diagnosis.json").write_text(json.dumps(said))
-    monkeypatch.setattr(sys, "argv", ["x", "score", "--work", str(tmp_path), "--only", *(c.name for c in controls)])
-    assert effects.main() == 0
-    shown = capsys.readouterr().out.splitlines()
-    row = next(n for n, line in enumerate(shown) if line.startswith("|") and "without cross_fit" in line)
-    assert "without settle" not in shown[row]
-    assert "0/1 = 0 %" in shown[row + 2] and "1/1 = 100 %" in shown[row + 2]  # controls: anything but none
 
 
 def test_fake_laws_are_six_null_at_null_and_only_in_their_own_process(bench: dict[str, ModuleType]) -> None:
