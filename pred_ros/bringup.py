@@ -20,6 +20,7 @@ import yaml
 from pred_core.cli.main import BAD_INPUT
 from pred_core.config import load_yaml
 from pred_core.errors import ConfigError, PredError, nearest
+from pred_ros.node_parameters import check_parameters
 from pred_ros.processes import NODES, Children, node_command, node_environment
 
 PARAMETERS = "ros__parameters"
@@ -34,7 +35,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--logs", type=Path, help="folder for the nodes' output; default: a temporary one")
     args = parser.parse_args(argv)
     try:
-        return run(read_nodes(args.file, args.overrides), args.domain, args.logs)
+        nodes = read_nodes(args.file, args.overrides)
+        check_parameters(nodes)
+        return run(nodes, args.domain, args.logs)
     except PredError as error:
         print(f"pred_bringup: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -63,7 +66,12 @@ def apply_overrides(nodes: dict[str, dict[str, Any]], overrides: Sequence[str]) 
         node, dot, parameter = target.partition(".")
         if not equals or not dot or node not in nodes:
             raise ConfigError(f"override '{override}'", allowed=f"NODE.PARAMETER=VALUE with {', '.join(nodes)}")
-        nodes[node][parameter] = yaml.safe_load(value)
+        try:
+            nodes[node][parameter] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ConfigError(
+                f"override '{override}'", got="a value that is not YAML", allowed="a number, true, false, text"
+            ) from error
 
 
 def run(nodes: dict[str, dict[str, Any]], domain: int | None, logs: Path | None) -> int:

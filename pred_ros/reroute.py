@@ -14,7 +14,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -31,11 +31,13 @@ from pred_core.plant.live.slot import SlotConfig
 from pred_core.twin import Twin
 from pred_core.types import Array
 from pred_ros.bringup import apply_overrides, read_nodes
+from pred_ros.node_parameters import check_parameters
 from pred_ros.reroute_faults import FAULTS, Fault
 from pred_ros.reroute_loop import BAG, Job, run
 from pred_ros.reroute_report import PAGE, VIDEO, lead, outcome, write_report
 from pred_ros.reroute_verdict import Verdict, judge
 from pred_ros.resources import config_folder
+from pred_ros.tracker_node import parse_fixtures
 
 NOT_REACHED = 1
 NODES = ("plant", "tracker", "predictor", "planner", "arm")
@@ -118,12 +120,16 @@ def check_times(args: argparse.Namespace) -> None:
 def prepare(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """Parameters of every node: the file's, a free port, the twin, the planner's settings, then the overrides.
 
-    Planner and tracker are told the plant's gap.
+    Planner and tracker are told the plant's gap; fixtures that are not the posts of the file's own gap stay as given.
+    Raises: ConfigError, also for what a node would refuse.
     """
     nodes = read_nodes(args.nodes)
     missing = [n for n in NODES if n not in nodes]
     if missing:
         raise ConfigError(f"{args.nodes}: {', '.join(missing)} missing", got=", ".join(nodes), allowed=", ".join(NODES))
+    ignored = nodes["tracker"].get("fixtures")
+    if isinstance(ignored, str) and parse_fixtures(ignored) == parse_fixtures(fixtures_of(slot_of(nodes["plant"]))):
+        del nodes["tracker"]["fixtures"]
     port = free_port()
     for node in ("plant", "arm"):
         nodes[node]["port"] = port
@@ -133,12 +139,17 @@ def prepare(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     nodes["planner"].setdefault("settings", str(config_folder() / "plan" / "slot.yaml"))
     nodes["planner"]["seed"] = args.seed
     apply_overrides(nodes, args.overrides)
-    slot = from_mapping(SlotConfig, {"gap": nodes["plant"].get("gap", SlotConfig.gap)}, "plant")
+    slot = slot_of(nodes["plant"])
     if load_settings(nodes["planner"]["settings"]).slot is not None:
         nodes["planner"].setdefault("gap", slot.gap)
-    if not any(o.startswith("tracker.fixtures=") for o in args.overrides):
-        nodes["tracker"]["fixtures"] = fixtures_of(slot)
+    nodes["tracker"].setdefault("fixtures", fixtures_of(slot))
+    check_parameters(nodes)
     return nodes
+
+
+def slot_of(plant: Mapping[str, Any]) -> SlotConfig:
+    """The slot that the plant will have. Raises: ConfigError for a gap that cannot be."""
+    return from_mapping(SlotConfig, {"gap": plant.get("gap", SlotConfig.gap)}, "plant")
 
 
 def fixtures_of(slot: SlotConfig) -> str:

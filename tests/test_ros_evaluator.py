@@ -24,7 +24,6 @@ from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
 from ros_bench import Bench, bench_of, own_domain
 from std_msgs.msg import String
 
-from pred_core.config import load_yaml
 from pred_core.live import marks
 from pred_core.twin import Extension, ResidualWeights, Twin
 from pred_core.types import State
@@ -32,11 +31,12 @@ from pred_ros import bringup, convert, qos, shell
 from pred_ros.arm_node import ArmNode
 from pred_ros.evaluator_node import EvaluatorNode
 from pred_ros.live_report import stage_name
+from pred_ros.node_parameters import check_parameters, config_class
 from pred_ros.planner_node import PlannerNode
 from pred_ros.plant_node import PlantNode
 from pred_ros.player_node import PlayerNode
 from pred_ros.predictor_node import PredictorNode
-from pred_ros.processes import Children
+from pred_ros.processes import NODES, Children
 from pred_ros.tracker_node import TrackerNode
 
 ROOT = Path(__file__).parents[1]
@@ -227,14 +227,15 @@ def test_descriptors_carry_unit_and_range(bench: Bench) -> None:
 
 @pytest.mark.parametrize("file", sorted((ROOT / "config" / "nodes").glob("*.yaml")), ids=lambda p: p.name)
 def test_shipped_parameter_files_fit_the_nodes(file: Path) -> None:
-    nodes = (PlayerNode, PredictorNode, EvaluatorNode, ArmNode, TrackerNode, PlannerNode, PlantNode)
-    classes = {c.NAME: c.CONFIG for c in nodes}
-    from pred_core.config import from_mapping
+    nodes = bringup.read_nodes(file)
+    check_parameters(nodes)
+    with pytest.raises(ValueError, match="unknown key 'fctor'"):
+        check_parameters({**nodes, next(iter(nodes)): {"fctor": 1.0}})
 
-    for name, parameters in bringup.read_nodes(file).items():
-        own = {k: v for k, v in parameters.items() if k != "use_sim_time"}  # which every ROS node has
-        from_mapping(classes[name], own, f"{file.name}: {name}")
-    assert load_yaml(file)
+
+def test_every_node_has_parameters_of_its_own() -> None:
+    nodes = (PlayerNode, PredictorNode, EvaluatorNode, ArmNode, TrackerNode, PlannerNode, PlantNode)
+    assert {n: config_class(n) for n in NODES} == {c.NAME: c.CONFIG for c in nodes}
 
 
 def test_bringup_refuses_unknown_nodes_and_malformed_overrides(tmp_path: Path) -> None:

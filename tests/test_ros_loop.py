@@ -25,7 +25,7 @@ from sensor_msgs.msg import Image
 from pred_core.errors import PredError
 from pred_core.plant.live.slot import SlotConfig
 from pred_core.plant.live.success import Passage, judge_passage
-from pred_ros import convert, reroute, reroute_loop
+from pred_ros import bringup, convert, reroute, reroute_loop
 from pred_ros.camera_pairs import CameraPairs
 from pred_ros.processes import Children
 from pred_ros.reroute_faults import FAULTS
@@ -224,6 +224,39 @@ def test_planner_and_tracker_know_the_gap_of_the_plant() -> None:
         assert all(b.half_size == pytest.approx((0.045, 0.006, 0.05)) for b in boxes)
     assert given("planner.gap=0.02", "tracker.fixtures=''")["planner"]["gap"] == 0.02
     assert given("tracker.fixtures=''")["tracker"]["fixtures"] == ""
+
+
+def test_a_file_may_name_other_fixtures_than_the_posts(tmp_path: Path) -> None:
+    """A third box stays whatever the gap; a file that names none, or the posts of its own gap, follows the gap."""
+    shipped = (ROOT / "config" / "nodes" / "reroute.yaml").read_text()
+    posts = next(line for line in shipped.splitlines() if line.strip().startswith("fixtures:"))
+    narrow = reroute.fixtures_of(SlotConfig(gap=0.016))
+    own = "0.4 0.2 0.05 0.02 0.02 0.05"
+    for named, wanted in ((f"    fixtures: '{own}'", own), ("", narrow), (posts, narrow)):
+        file = tmp_path / "nodes.yaml"
+        file.write_text(shipped.replace(posts, named))
+        nodes = reroute.prepare(reroute._parser().parse_args(["--nodes", str(file), "plant.gap=0.016"]))
+        assert parse_fixtures(nodes["tracker"]["fixtures"]) == parse_fixtures(wanted), named
+
+
+@pytest.mark.parametrize(("wrong", "told"), [
+    ("plant.fctor=0.5", "parameters of plant: unknown key 'fctor'. did you mean 'factor'?"),
+    ("plant.factor=fast", "parameters of plant: factor; got 'fast' (str); allowed: float."),
+    ("planner.budget=-1.0", "parameters of planner: budget; got -1.0 s; allowed: "),
+    ("tracker.cameras=[cam0", "override 'tracker.cameras=[cam0'; got a value that is not YAML"),
+])  # fmt: skip
+def test_what_a_node_would_refuse_is_told_before_any_has_started(
+    wrong: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def forbidden(*_: object) -> None:
+        raise AssertionError("a node was started")
+
+    monkeypatch.setattr(Children, "start", forbidden)
+    assert reroute.main(["--out", str(tmp_path / "out"), wrong]) == 2
+    assert bringup.main([str(ROOT / "config" / "nodes" / "reroute.yaml"), wrong]) == 2
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith(f"pred_reroute: {told}") and second.startswith(f"pred_bringup: {told}")
+    assert not list(tmp_path.iterdir())
 
 
 def test_success_must_last() -> None:
