@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pred_core.errors import DivergenceError
+from pred_core.plant.contact_bias import add_contact_bias
 from pred_core.plant.drive import DOF, Drive
 from pred_core.plant.hidden.effect import HiddenEffect
 from pred_core.plant.motion import Motion
@@ -110,6 +111,7 @@ class World:
     def finish_step(self, drive: Pusher | None, index: int, drag: float) -> None:
         """The second half of a step: effects, drive, forces, integration."""
         data = self.data
+        add_contact_bias(self.model, data)
         data.xfrc_applied[:] = 0.0
         if drag:
             self.add_force(-drag * self.mass[:, None] * self.velocity)
