@@ -11,6 +11,7 @@ from report_cases import judged, rope
 from pred_core.diagnose import evidence
 from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals, set_limit, simplest
 from pred_core.diagnose.progress import Named, refitted
+from pred_core.diagnose.ranking import nothing
 from pred_core.diagnose.trial import make_trial
 from pred_core.effects import find_effect
 from pred_core.twin import Twin
@@ -172,3 +173,11 @@ def test_rivals_are_counted_in_standard_errors(twin: Twin) -> None:
 
 
 # Samples, restarts, weights -------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_the_less_likely_the_nearer_a_candidate_came_to_a_name() -> None:
+    """a = ln 0.88 / ln 0.05 = 0.0427; at p = 0.05 the density of effects is 0.0427 x 0.05^-0.9573 = 0.751."""
+    assert nothing(1.0) == pytest.approx(1.0 / 1.0427, abs=1e-4)
+    assert nothing(0.05) == pytest.approx(1.0 / 1.751, abs=2e-3)
+    values = [nothing(p) for p in (1e-9, 0.01, 0.05, 0.1, 0.3, 1.0)]
+    assert values == sorted(values) and 0.0 < values[0] < 0.01

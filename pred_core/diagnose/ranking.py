@@ -12,7 +12,8 @@ from pred_core.diagnose.result import Ranked
 
 SHARP = 1.0  # how fast a rival's weight falls with the standard errors it is behind
 COLD = 0.8  # without a reference: what engine and object lack in common can look like a cause
-UNSEEN = 0.05  # probability left for "unknown" where nothing is seen, and for "none" where something is
+UNSEEN = 0.05  # probability left for "none" where something is seen that no candidate explains
+FOUND = 0.88, 0.05  # share of hidden effects (75 of 85 seen cases) that give a family-wise p below this
 EXPLAINS = (0.45, 8.0)  # share of the excess closed at which "it explains it" is even, and how steeply that rises
 
 
@@ -20,6 +21,18 @@ def explains(closed: float) -> float:
     """Probability that a cause that closes this share of the excess is not a stand-in for something unknown."""
     middle, slope = EXPLAINS
     return 1.0 / (1.0 + math.exp(-slope * (min(closed, 1.0) - middle)))
+
+
+def nothing(p: float) -> float:
+    """Probability that nothing is there, from the least family-wise p of a round in which nothing was named.
+
+    Even odds before; p is uniform where nothing is there, and distributed as p^a where something is (Beta(a, 1); Sellke,
+    Bayarri and Berger, The American Statistician 55, 2001), a from how often effects are found.
+    """
+    share, level = FOUND
+    a = math.log(share) / math.log(level)
+    density: float = a * max(p, 1e-6) ** (a - 1.0)
+    return 1.0 / (1.0 + density)
 
 
 def confidence(named: Named, floor: bool) -> float:
@@ -55,13 +68,15 @@ def _row(n: Named, probability: float) -> Ranked:
 
 def _first_round(progress: Progress, floor: bool) -> list[Ranked]:
     chosen = next((n for n in progress.named if n.round == 0), None)
-    none = 0.0 if chosen is not None else UNSEEN if progress.unknown else 1.0 - UNSEEN
+    judged = progress.rounds[0].judged if progress.rounds else ()
+    least = min((p for _, p, _ in judged), default=1.0)
+    none = 0.0 if chosen is not None else UNSEEN if progress.unknown else nothing(least)
     sure = 0.0 if chosen is None else confidence(chosen, floor)
     end = [
         Ranked("unknown", "unknown", max(0.0, 1.0 - sure - none), 0.0, 1.0, ""),
         Ranked("none", "none", none, 0.0, 1.0, ""),
     ]
-    if not progress.rounds or not progress.rounds[0].judged:
+    if not judged:
         return end
     return [*_finalists(progress.rounds[0], chosen, sure), *end]
 
