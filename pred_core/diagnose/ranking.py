@@ -26,8 +26,8 @@ def explains(closed: float) -> float:
 def nothing(p: float) -> float:
     """Probability that nothing is there, from the least family-wise p of a round in which nothing was named.
 
-    Even odds before; p is uniform where nothing is there, and distributed as p^a where something is (Beta(a, 1); Sellke,
-    Bayarri and Berger, The American Statistician 55, 2001), a from how often effects are found.
+    Even odds before; p is uniform where nothing is there, and distributed as p^a where something is (Beta(a, 1);
+    Sellke, Bayarri and Berger, The American Statistician 55, 2001), a from how often effects are found.
     """
     share, level = FOUND
     a = math.log(share) / math.log(level)
