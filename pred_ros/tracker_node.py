@@ -29,7 +29,7 @@ from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, STATE_POINTS, TRACK
 from pred_core.config import setting
 from pred_core.errors import ConfigError, PredError
 from pred_core.track.estimate import Estimate, Prior
-from pred_core.track.line_tracker import LineConfig
+from pred_core.track.line_config import LineConfig
 from pred_core.track.surface_tracker import SurfaceConfig
 from pred_core.track.tracker import MOST_CAMERAS, Tracker, TrackerConfig
 from pred_core.track.workspace import Workspace

@@ -17,9 +17,9 @@ from pred_core.track.band import ChainSystem
 from pred_core.track.color_model import ColorModel
 from pred_core.track.estimate import Estimate, Prior
 from pred_core.track.grasp import GripperPath
+from pred_core.track.line_config import LineConfig
 from pred_core.track.line_fit import Cloud, LineFitConfig, fit_line
 from pred_core.track.line_start import LineStartConfig, find_line, resample
-from pred_core.track.line_tracker import LineConfig
 from pred_core.track.tracker import Tracker, TrackerConfig
 from pred_core.track.workspace import Workspace, inside_any
 from pred_core.types import Array, Box, Capsule, Sphere

@@ -8,7 +8,7 @@ from pred_core.bag import images
 from pred_core.bag.clouds import PointFrame
 from pred_core.plant.live.cell import Cell
 from pred_core.plant.live.station import Picture
-from pred_core.track.line_tracker import LineConfig
+from pred_core.track.line_config import LineConfig
 from pred_core.track.tracker import Tracker, TrackerConfig
 from pred_core.track.workspace import Workspace
 from pred_core.types import Array, CameraFrame

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from pred_core.config import setting
 from pred_core.track.color_model import of_same_hue
+from pred_core.track.line_fit import Anchors, Cloud, LineFitConfig, fit_line
 from pred_core.types import Array
 
 MAX_VOXELS = 20000  # more is not a line object but a mask that lets everything through
@@ -21,6 +22,7 @@ SIDEWAYS = 0.7  # of a piece behind a hole, to the way ahead
 LEAST_CELLS = 3  # of a piece behind a hole
 MOSTLY = 0.9  # of its cells lie ahead and have the line's colour
 THIN = 90  # percent of a line's points that are near to its middle
+SETTLE_ROUNDS, SETTLE_ITERATIONS = 8, 3  # a length that is not known is after each round what the points have
 
 
 @dataclass(frozen=True)
@@ -203,3 +205,15 @@ def _order(cells: Array, graph: csr_matrix, config: LineStartConfig) -> Array | 
 def _reach(graph: csr_matrix, start: int) -> Array:
     away = dijkstra(graph, directed=False, indices=start)
     return np.where(np.isfinite(away), away, -1.0)
+
+
+def settle(
+    nodes: Array, cloud: Cloud, radius: float, config: LineFitConfig, length: float | None, ends: Anchors
+) -> tuple[Array, float]:
+    """Nodes (N, 3) [m] fitted from a rough path, and their length [m]: the given one, else the one its points have."""
+    for _ in range(SETTLE_ROUNDS):
+        edge = np.linalg.norm(np.diff(nodes, axis=0), axis=-1)
+        spacing = (float(edge.sum()) if length is None else length) / (len(nodes) - 1)
+        fit = fit_line(nodes, spacing, cloud, radius, config, ends, iterations=SETTLE_ITERATIONS)
+        nodes = fit.nodes if length is not None else resample(fit.nodes, len(nodes))
+    return nodes, float(np.linalg.norm(np.diff(nodes, axis=0), axis=-1).sum())

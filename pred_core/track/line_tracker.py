@@ -4,58 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pred_core.config import setting
 from pred_core.track.color_model import ColorModel
 from pred_core.track.estimate import Estimate, Prior, Status, odd_one, trace_confidence
-from pred_core.track.grasp import Grasp, GraspConfig
-from pred_core.track.line_ends import LEAST, LineEnds, extended
-from pred_core.track.line_fit import (
-    SURFACE,
-    Anchors,
-    Cloud,
-    LineFit,
-    LineFitConfig,
-    fit_line,
-    view_distances,
-    without_view,
-)
-from pred_core.track.line_start import FoundLine, LineStartConfig, find_line, resample
+from pred_core.track.grasp import Grasp
+from pred_core.track.line_cloud import cloud_of, contradicted, find_in, near, newest
+from pred_core.track.line_config import LineConfig
+from pred_core.track.line_ends import LEAST_CORRECTION, LineEnds, extended
+from pred_core.track.line_fit import Anchors, Cloud, LineFit, fit_line, view_distances, without_view
+from pred_core.track.line_grips import Poses, closed_grips, ends_in_tools, from_first_end
+from pred_core.track.line_start import FoundLine, resample, settle
 from pred_core.track.line_width import radius_of
 from pred_core.track.view import View
 from pred_core.types import Array, Tracks
 
-Poses = tuple[Array, Array]
-OBSTACLE = 0.015  # [m] before a node, beyond errors of depth and of the fit
-SAME_TIME = 10_000_000  # [ns]
 GROWN = 0.03  # of the length: less is noise
 STILL = 0.005  # [m] standard deviation of the motion prior of a particle in view, beside its acceleration
-
-
-@dataclass(frozen=True)
-class LineConfig:
-    """What is known of the line, and how it is followed."""
-
-    length: float = setting(0.0, unit="m", low=0.0, high=20.0, doc="0: measured when it is found")
-    radius: float = setting(0.0, unit="m", low=0.0, high=0.1, doc="0: measured when it is found")
-    particles: int = setting(61, low=4, high=400, doc="nodes, evenly along the line; ids count from end 0")
-    points: int = setting(600, low=50, high=20000, doc="most points used of one camera")
-    acceleration: float = setting(10.0, unit="m/s^2", low=0.1, high=1000.0, doc="that the motion prior allows for")
-    bridge: float = setting(0.08, unit="m", low=0.0, high=0.5, doc="longest end hidden in a gripper's jaws")
-    end_in_tool: bool = setting(True, doc="a held end is in the tool centre; false: where it is seen")
-    seen: float = setting(1.5, low=0.1, high=100.0, doc="points of one camera at a particle that make it visible")
-    doubt: float = setting(0.96, low=0.0, high=1.0, doc="points explained less nodes contradicted; below, look anew")
-    lost: float = setting(0.5, low=0.0, high=1.0, doc="share of the points on the line below which it is lost")
-    patience: float = setting(0.4, unit="s", low=0.0, high=10.0, doc="how long before it is searched anew")
-    tolerance: float = setting(0.15, low=0.01, high=1.0, doc="relative difference of length when it is found again")
-    growing: float = setting(1.0, unit="s", low=0.0, high=60.0, doc="for how long a measured length may still grow")
-    fit: LineFitConfig = LineFitConfig()
-    start: LineStartConfig = LineStartConfig()
-    grasp: GraspConfig = GraspConfig()
+UNSEEN = 0.1  # [m] the same of one that has not been in view for long, at most
+TRUST_SEEN, TRUST_UNSEEN = 0.7, 0.3  # share of the newest velocity of a particle that is in view, or is not
+BETTER = 0.02  # of the score: a fit from scratch that explains less than this more is no better
 
 
 class LineTracker:
@@ -82,7 +52,7 @@ class LineTracker:
 
     def start(self, views: Sequence[View], stamp: int, poses: Poses | None, closed: NDArray[np.bool_]) -> list[View]:
         """Look for the line. Returns the part of each view that is on it; nothing if it is not found."""
-        found = _find(views, self.config.start)
+        found = find_in(views, self.config.start)
         return [] if found is None else self._begin(found, views, stamp, poses, closed, self.length > 0.0)
 
     def _begin(
@@ -101,8 +71,8 @@ class LineTracker:
         nodes = resample(path, self.config.particles)
         radius = self.config.radius or radius_of(members, nodes)
         cloud = self._cloud(members, stamp, radius)
-        ends = self._ends_in_tools(nodes, poses, closed)
-        nodes, length = _settle(nodes, cloud, radius, self.config, self.length if known else None, ends)
+        ends = ends_in_tools(nodes, closed_grips(poses, closed), self.config)
+        nodes, length = settle(nodes, cloud, radius, self.config.fit, self.length if known else None, ends)
         if known and abs(length - self.length) > self.config.tolerance * self.length:
             return []
         if not known:
@@ -140,7 +110,7 @@ class LineTracker:
             information = np.tile(np.eye(3) / self.config.fit.reach**2, (len(anew), 1, 1))
         information[held] = np.eye(3) / self.config.grasp.sigma**2
         expected[held] = place
-        cloud = self._cloud([_near(v, expected, self.config.fit.reach) for v in views], stamp, self.radius)
+        cloud = self._cloud([near(v, expected, self.config.fit.reach) for v in views], stamp, self.radius)
         anchors = Anchors(expected, information)
         fit = fit_line(expected, self.spacing, cloud, self.radius, self.config.fit, anchors, self.velocity)
         odd = odd_one(fit.off)
@@ -150,7 +120,7 @@ class LineTracker:
             off = view_distances(fit.nodes, cloud, self.radius, self.velocity)
             fit = dataclasses.replace(fit, off=off)
             views = [v for k, v in enumerate(views) if k != odd]
-        score = fit.explained - _contradicted(views, fit)
+        score = fit.explained - contradicted(views, fit)
         if score < self.config.doubt:
             fit = self._second_opinion(fit, score, views, stamp, poses)
         fit = self._trim(fit, views, stamp, poses, color)
@@ -163,7 +133,7 @@ class LineTracker:
         """The first pictures may have missed an end: start again where a later one shows more of the line."""
         if not self._growing(stamp):
             return
-        found = _find(views, self.config.start)
+        found = find_in(views, self.config.start)
         if found is None or found.length < (1.0 + GROWN) * self.length or not self._is_on(found.path):
             return
         self._begin(found, views, stamp, poses, self._closed, known=False)
@@ -177,11 +147,10 @@ class LineTracker:
         """Where a measured length may still change: move free ends to where the pictures say that they are."""
         if not self._growing(stamp):
             return fit
-        newest = max((v.stamp for v in views), default=0)
-        self._ends.watch(fit.nodes, self.radius, [v for v in views if newest - v.stamp < SAME_TIME], color)
-        tools = self._ends_in_tools(fit.nodes, poses, self._closed)
+        self._ends.watch(fit.nodes, self.radius, newest(views), color)
+        tools = ends_in_tools(fit.nodes, closed_grips(poses, self._closed), self.config)
         first, last = self._ends.correction((bool(tools.information[0].any()), bool(tools.information[-1].any())))
-        if max(abs(first), abs(last)) < LEAST:
+        if max(abs(first), abs(last)) < LEAST_CORRECTION:
             return fit
         nodes = resample(extended(fit.nodes, first, last), len(fit.nodes))
         for end in (0, -1):
@@ -198,16 +167,6 @@ class LineTracker:
         away = np.linalg.norm(self.nodes[:, None] - dense[None], axis=-1).min(axis=1)
         return bool(np.median(away) < self.config.fit.reach)
 
-    def _ends_in_tools(self, nodes: Array, poses: Poses | None, closed: NDArray[np.bool_]) -> Anchors:
-        """A held end is in the tool centre, which the jaws hide."""
-        target, information = nodes.copy(), np.zeros((len(nodes), 3, 3))
-        grips = np.zeros((0, 3)) if poses is None else poses[0][: len(closed)][closed[: len(poses[0])]]
-        for gripper in grips if self.config.end_in_tool else ():
-            end = min((0, -1), key=lambda e: float(np.linalg.norm(nodes[e] - gripper)))  # noqa: B023 (used at once)
-            if np.linalg.norm(nodes[end] - gripper) < self.config.grasp.radius:
-                target[end], information[end] = gripper, np.eye(3) / self.config.grasp.sigma**2
-        return Anchors(target, information)
-
     def _second_opinion(
         self, fit: LineFit, score: float, views: Sequence[View], stamp: int, poses: Poses | None
     ) -> LineFit:
@@ -220,11 +179,11 @@ class LineTracker:
         information[held], target[held] = np.eye(3) / self.config.grasp.sigma**2, place
         cloud = self._cloud(views, stamp, self.radius)
         anew = fit_line(nodes, self.spacing, cloud, self.radius, self.config.fit, Anchors(target, information))
-        return anew if anew.explained - _contradicted(views, anew) > score + 0.02 else fit
+        return anew if anew.explained - contradicted(views, anew) > score + BETTER else fit
 
     def _anew(self, views: Sequence[View], poses: Poses | None) -> Array | None:
         """Nodes (N, 3) from scratch; None if nothing of this length is found."""
-        found = _find(views, self.config.start)
+        found = find_in(views, self.config.start)
         if found is None or abs(found.length - self.length) > self.config.tolerance * self.length:
             return None
         return resample(self._oriented(found.path, poses, self._closed), self.config.particles)
@@ -247,9 +206,9 @@ class LineTracker:
         assert self.nodes is not None
         if dt > 0:
             measured = (fit.nodes - self.nodes) / dt
-            blend = np.where(visible, 0.7, 0.3)[:, None]
+            blend = np.where(visible, TRUST_SEEN, TRUST_UNSEEN)[:, None]
             self.velocity = (1.0 - blend) * self.velocity + blend * measured
-        grown = np.minimum(sigma**2, 0.1**2)
+        grown = np.minimum(sigma**2, UNSEEN**2)
         self._variance = np.where(visible, STILL**2, grown)
         self.nodes = fit.nodes
 
@@ -273,65 +232,12 @@ class LineTracker:
         )
 
     def _cloud(self, views: Sequence[View], stamp: int, radius: float) -> Cloud:
-        """At most `points` of each view, moved from the surface onto the centreline."""
-        picked = [v.select(np.arange(0, len(v.pixel), max(1, -(-len(v.pixel) // self.config.points)))) for v in views]
-        rays = np.concatenate([v.rays for v in picked])
-        return Cloud(
-            np.concatenate([v.points for v in picked]) + SURFACE * radius * rays,
-            rays,
-            np.concatenate([v.depth for v in picked]),
-            np.concatenate([np.full(len(v.pixel), i) for i, v in enumerate(picked)]),
-            np.concatenate([np.full(len(v.pixel), (stamp - v.stamp) * 1e-9) for v in picked]),
-        )
+        return cloud_of(views, stamp, radius, self.config.points)
 
     def _oriented(self, path: Array, poses: Poses | None, closed: NDArray[np.bool_]) -> Array:
-        """End 0 is where it was before; at first the end nearest to a closed gripper, else the one of smaller x."""
-        if self.nodes is not None:
-            there = resample(path, len(self.nodes))
-            away, swapped = (float(np.abs(p - self.nodes).sum()) for p in (there, there[::-1]))
-            return path if away <= swapped else path[::-1]
-        grips = np.zeros((0, 3)) if poses is None else poses[0][: len(closed)][closed[: len(poses[0])]]
-        if not len(grips):
-            return path if path[0, 0] <= path[-1, 0] else path[::-1]
-        ends = np.linalg.norm(path[[0, -1]][:, None] - grips[None], axis=-1)  # (2, G)
-        path = path if ends[0].min() <= ends[1].min() else path[::-1]
-        for gripper in grips[:2]:  # the jaws hide the end of what they hold
-            for end in (0, -1):
-                gap = float(np.linalg.norm(path[end] - gripper))
-                if self.config.start.voxel < gap < self.config.bridge:
-                    path = np.concatenate([gripper[None], path] if end == 0 else [path, gripper[None]])
-        return path
-
-
-def _find(views: Sequence[View], config: LineStartConfig) -> FoundLine | None:
-    return find_line(np.concatenate([v.points for v in views]), np.concatenate([v.color for v in views]), config)
-
-
-def _contradicted(views: Sequence[View], fit: LineFit) -> float:
-    """Share of the nodes where no camera sees the line although nothing stands before it."""
-    found = np.zeros(len(fit.nodes), bool)
-    newest = max((v.stamp for v in views), default=0)
-    for view in views:
-        if newest - view.stamp < SAME_TIME:  # an older picture may have been true
-            found |= view.unobstructed(fit.nodes, OBSTACLE)
-    return float((found & (fit.support == 0)).mean())
-
-
-def _near(view: View, nodes: Array, reach: float) -> View:
-    """The points within the box around the nodes, `reach` [m] wider."""
-    low, high = nodes.min(axis=0) - reach, nodes.max(axis=0) + reach
-    keep = ((view.points >= low) & (view.points <= high)).all(axis=-1)
-    return view if keep.all() else view.select(keep)
-
-
-def _settle(
-    nodes: Array, cloud: Cloud, radius: float, config: LineConfig, length: float | None, ends: Anchors
-) -> tuple[Array, float]:
-    """Fit from a rough path; without a given length the line takes the one its points have."""
-    total = length
-    for _ in range(8):
-        edge = np.linalg.norm(np.diff(nodes, axis=0), axis=-1)
-        spacing = (float(edge.sum()) if total is None else total) / (len(nodes) - 1)
-        fit = fit_line(nodes, spacing, cloud, radius, config.fit, ends, iterations=3)
-        nodes = fit.nodes if total is not None else resample(fit.nodes, len(nodes))
-    return nodes, float(np.linalg.norm(np.diff(nodes, axis=0), axis=-1).sum())
+        """End 0 is where it was before; at first the grippers say it."""
+        if self.nodes is None:
+            return from_first_end(path, closed_grips(poses, closed), self.config)
+        there = resample(path, len(self.nodes))
+        away, swapped = (float(np.abs(p - self.nodes).sum()) for p in (there, there[::-1]))
+        return path if away <= swapped else path[::-1]

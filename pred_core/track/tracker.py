@@ -12,7 +12,8 @@ from pred_core.config import setting
 from pred_core.errors import ConfigError, InputError, nearest
 from pred_core.track.estimate import Estimate, Prior
 from pred_core.track.grasp import GripperPath
-from pred_core.track.line_tracker import LineConfig, LineTracker
+from pred_core.track.line_config import LineConfig
+from pred_core.track.line_tracker import LineTracker
 from pred_core.track.mask import ObjectMask
 from pred_core.track.surface_tracker import SurfaceConfig, SurfaceTracker
 from pred_core.track.view import View, check_frame
