@@ -74,7 +74,8 @@ def test_flow_finds_a_known_shift_and_refuses_what_is_hidden() -> None:
     after[80:] = 128  # the lower part is covered
     pixel = np.array([[50.0, 40.0], [90.0, 30.0], [60.0, 100.0]])
     there, good = follow_pixels(speckle(), after, pixel, pixel)
-    np.testing.assert_allclose(there[:2] - pixel[:2], [[4.0, 2.0]] * 2, atol=0.1)
+    # A shift by whole pixels interpolates nothing: Lucas-Kanade ends where a step is below 0.01 px.
+    np.testing.assert_allclose(there[:2] - pixel[:2], [[4.0, 2.0]] * 2, atol=0.01)
     assert good.tolist() == [True, True, False]
 
 
@@ -85,7 +86,8 @@ def test_first_seen_patch_corrects_a_wrong_pixel() -> None:
     templates.keep(speckle(), np.array([0, 1]), pixel, tangents, np.zeros((2, 3)))
     wrong = pixel + [[4.0 + 1.2, 2.0 - 0.9], [4.0 + 30.0, 2.0]]
     found, correlation = templates.match(speckle((4, 2)), np.array([0, 1]), wrong, tangents)
-    np.testing.assert_allclose(found[0], pixel[0] + [4.0, 2.0], atol=0.1)
+    # OpenCV interpolates at multiples of 1/32 px: half of one is 0.016 px.
+    np.testing.assert_allclose(found[0], pixel[0] + [4.0, 2.0], atol=0.02)
     assert correlation[0] > 0.95 and correlation[1] == 0.0, "30 px off is no match"
 
 
@@ -101,8 +103,10 @@ def test_a_faint_print_is_an_anchor_and_a_plain_cloth_is_none() -> None:
         templates.keep(before, np.array([0, 1]), pixel, tangents, np.zeros((2, 3)))
         place, correlation = templates.match(after, np.array([0, 1]), pixel + [4.7, 1.5], tangents)
         assert (correlation > 0.0).tolist() == [found, found]
-        if found:  # noise of 1 level in both pictures, 225 pixels, gradients of 3 levels a pixel: 0.03 px
-            np.testing.assert_allclose(place, pixel + [4.0, 2.0], atol=0.2)
+        # Noise of 1 level and rounding in both pictures, 225 pixels, gradients of 4 levels a pixel: 1.5 / (4 * 15) =
+        # 0.025 px in each direction; four of them.
+        if found:
+            np.testing.assert_allclose(place, pixel + [4.0, 2.0], atol=0.1)
 
 
 def test_depth_at_an_edge_is_none() -> None:
@@ -122,7 +126,9 @@ def test_rigid_motion_of_a_few_carries_all() -> None:
     weight = np.full(48, 1e-6)
     weight[[0, 7, 40, 47]] = 10.0
     found = RigidityGraph(rest).solve(rest, truth * (weight > 1)[:, None], weight, 2.0, rounds=60)
-    assert np.linalg.norm(found - truth, axis=-1).max() < 0.002  # the corners' motion reaches the middle
+    # The corners' motion reaches the middle. The 44 others pull with 1e-6 each towards 0, 0.3 m away, the corners with
+    # 40 together: 0.3 um, and some times that where it bends.
+    assert np.linalg.norm(found - truth, axis=-1).max() < 2e-6
 
 
 def test_spread_covers_evenly() -> None:
@@ -131,7 +137,10 @@ def test_spread_covers_evenly() -> None:
     from scipy.spatial import cKDTree
 
     gap = cKDTree(found).query(found, k=2)[0][:, 1]
-    assert gap.min() > 0.012  # 100 points on 0.3 m x 0.3 m: 3 cm apart on a grid, at worst half of it
+    # Discs around the 100 cover 0.3 m x 0.3 m: they are wider, and their middles farther apart, than 16.9 mm. Each is
+    # then the mean of the 12 points around it, a disc of 8.3 mm: moved by 8.3 / 2 / sqrt(12) = 1.2 mm in each
+    # direction, so that two of them, two deviations each, come nearer by 4.8 mm.
+    assert gap.min() > 0.012
 
 
 def test_board_is_followed_and_the_rollout_drifts(board: Board) -> None:
@@ -153,8 +162,9 @@ def test_board_is_followed_and_the_rollout_drifts(board: Board) -> None:
         error.append(np.linalg.norm(estimate.tracks.position - truth, axis=-1).mean())
         drift.append(np.linalg.norm(rolled - truth, axis=-1).mean())
     assert estimate.tracks.visible.mean() > 0.8 and estimate.status == "tracking"
-    assert error[-1] < 0.005  # a pixel is 2.7 mm
-    assert error[-1] < drift[-1]
+    # A pixel is 2.7 mm: patches and depth are known to a fraction of it. What adds up flow alone walks away from there.
+    assert max(error) < 0.5 * 0.0027
+    assert 2.0 * error[-1] < drift[-1]
 
 
 def test_covered_sheet_is_unseen_then_lost(board: Board) -> None:
