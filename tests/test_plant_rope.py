@@ -10,9 +10,10 @@ from scipy.optimize import brentq
 
 from pred_core.errors import ConfigError, DivergenceError
 from pred_core.plant.drive import Drive, poses
+from pred_core.plant.hidden.effect import HiddenEffect
 from pred_core.plant.hidden.library import make_effect
 from pred_core.plant.motion import FAST, draw_motion
-from pred_core.plant.rope import STEP, RopeConfig, build_rope
+from pred_core.plant.rope import STEP, RopeConfig, RopeModel, build_rope
 from pred_core.plant.rope_case import check_gripper, simulate_rope
 from pred_core.plant.session import SessionConfig, plan_session
 from pred_core.plant.world import Record, World, run_episode
@@ -174,6 +175,25 @@ def test_a_finer_step_tells_the_same_story_and_a_step_that_holds_is_kept(monkeyp
     moved = np.linalg.norm(once.position[-1] - once.position[0], axis=-1).max()
     apart = np.linalg.norm(once.position - twice.position, axis=-1).max()
     assert 0.0 < apart < 0.05 * moved, (apart, moved)
+
+
+def test_a_ball_in_the_grippers_way_is_told_also_where_the_usual_step_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its middle is where the jaws are to be after a second: they stop a radius, 2 cm, before; 1 mm is allowed."""
+    hurry(monkeypatch)
+    calm = plan("air", seconds=1.0)
+    path = calm.motion.path(0.0, round(1.0 / STEP), STEP).position[:, :3]
+    assert np.linalg.norm(path[-1] - path[0]) > 0.05, "it does not stand there from the beginning"
+
+    class Ball(HiddenEffect):
+        def build(self, rope: RopeModel) -> None:
+            rope.spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.02, 0, 0], pos=path[-1])
+
+    ball = Ball(0.02, np.random.default_rng(0))
+    kept = run_episode(World(build_rope(RopeConfig()), [ball]), calm.motion, 1.0, 30)  # MuJoCo warns of nothing
+    assert np.linalg.norm((kept.gripper - kept.reference)[-1, :3]) > 0.01
+    monkeypatch.setattr("pred_core.plant.rope_case.make_effect", lambda *_: ball)
+    with pytest.raises(DivergenceError, match="what is hidden stands in the gripper's way; got .* mm off its path"):
+        simulate_rope(calm, (("obstacle", 0.02),), 5, 1.0, 30)
 
 
 def test_a_gripper_that_is_kept_from_its_path_is_no_data() -> None:

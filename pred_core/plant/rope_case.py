@@ -75,8 +75,7 @@ def simulate_rope(
 
     A whip of the free end, or a rope that is laid into an obstacle, can be too fast for MuJoCo's step: such an episode,
     and no other, is simulated anew with a finer one. Raises: DivergenceError if the finest does not hold either, or if
-    what is hidden then keeps the gripper from where it is said to be (asked only of those episodes: what the usual step
-    simulates stays as it always was).
+    what is hidden keeps the gripper from where it is said to be.
     """
     for parts in PARTS:
         effects = tuple(make_effect(name, magnitude, seed, place) for place, (name, magnitude) in enumerate(hidden))
@@ -88,9 +87,8 @@ def simulate_rope(
             if parts == PARTS[-1]:
                 raise DivergenceError(f"{plan.name}: {error}") from error
             continue
-        if parts > 1:
-            check_gripper(record, plan.name)
         break
+    check_gripper(record, plan.name)
     return record, effects
 
 
