@@ -23,6 +23,7 @@ from pred_core.plan.rollouts import Rollouts
 from pred_core.plan.slot import Slot
 from pred_core.plan.stretch_cost import StretchCost
 from pred_core.plan.task import make_objective, scene_with_slot
+from pred_core.plan.through_cost import ThroughCost
 from pred_core.springmass import build_body
 from pred_core.springmass.reference import fixture_gap
 from pred_core.types import Body, Box, Capsule, Grip, Physics, Scene, Sphere
@@ -159,6 +160,60 @@ def test_passage_measures_how_far_beside_the_gap_a_line_crosses() -> None:
         PassageCost(slot, dataclasses.replace(body, kind="sheet"), 1.0)
 
 
+SLOT = Slot(x=0.0, y=0.0, yaw=0.0, gap=0.024, height=0.1)
+
+
+def across_slot(begin: float, y: float = 0.0, z: float = 0.05) -> np.ndarray:
+    """11 particles over 1 m along the way through the gap, from `begin` [m] on; the plane lies at 0."""
+    return row(11, 0.1, (begin, y, z))
+
+
+def test_through_is_how_far_a_line_is_through_as_its_goal_is() -> None:
+    body, goal = line_body(across_slot(-0.6), radius=0.004), across_slot(-0.65)
+    cost = ThroughCost(SLOT, body, goal, 1.0)
+    # Of the goal's 11 points 4 lie beyond: f* = 4/11, the smaller share. A line from -0.55 m on has f = 0.45.
+    ways = {
+        "as the goal": (across_slot(-7 / 11), 0.0),
+        "less far": (across_slot(-0.8), (4 / 11 - 0.2) / (4 / 11)),
+        "too far": (across_slot(-0.4), (0.6 - 4 / 11) / (4 / 11)),
+        "before the slot": (across_slot(-1.2), 1.0),
+        "behind it": (across_slot(0.1), 1.0),
+        "3 cm beside the opening": (across_slot(-7 / 11, y=0.038), 0.3),  # half the gap less the radius: 8 mm
+        "5 cm over it": (across_slot(-7 / 11, z=0.14), 0.5),  # it ends at 9 cm
+        "around the posts": (across_slot(-7 / 11, y=0.2), 1.0),
+    }
+    found = cost(rollouts(np.stack([line for line, _ in ways.values()])))
+    assert found.tolist() == pytest.approx([value for _, value in ways.values()], abs=1e-5)
+
+
+def test_through_does_not_ask_which_end_leads_nor_where_the_free_end_lies() -> None:
+    body, goal = line_body(across_slot(-0.6)), across_slot(-0.65)
+    cost = ThroughCost(SLOT, body, goal, 2.0)
+    line = across_slot(-0.8)
+    swung = line.copy()
+    swung[:8] = [-0.1, 0.0, 0.05] + 0.1 * np.outer(np.arange(7, -1, -1), [0.0, 1.0, 0.0])  # the free end to one side
+    mirrored = swung * [1.0, -1.0, 1.0]
+    same = cost(rollouts(np.stack([line, line[::-1], swung, mirrored])))
+    assert same.tolist() == pytest.approx([2.0 * (4 / 11 - 0.2) / (4 / 11)] * 4, abs=1e-5)
+    loop = np.concatenate([across_slot(-0.5)[:8], across_slot(-0.5)[6:3:-1]])  # to +0.2 m and back to -0.1 m
+    assert cost(rollouts(loop[None])).item() == pytest.approx(2.0), "pushed in and out again is not through"
+
+
+def test_through_weighs_the_way_and_the_end_and_asks_only_what_the_goal_does() -> None:
+    body, goal = line_body(across_slot(-0.6)), across_slot(-0.65)
+    there, not_yet = across_slot(-7 / 11), across_slot(-1.2)
+    one = rollouts(there[None])
+    moving = torch.tensor(np.stack([not_yet, not_yet, not_yet, there]), dtype=torch.float32)[:, None]
+    late = dataclasses.replace(one, position=moving, frames=(0, 1, 2, 3))
+    # Mean over the steps 3/4, last step 0.
+    assert ThroughCost(SLOT, body, goal, 1.0)(late).item() == pytest.approx(0.375, abs=1e-5)
+    assert ThroughCost(SLOT, body, not_yet, 1.0)(late).item() == 0.0
+    barely = row(101, 0.01, (-0.985, 0.0, 0.05))  # 2 of 101 points, 1.98 cm of 1 m: less than leads through
+    assert ThroughCost(SLOT, body, barely, 1.0)(late).item() == 0.0
+    with pytest.raises(ConfigError, match="a line"):
+        ThroughCost(SLOT, dataclasses.replace(body, kind="sheet"), goal, 1.0)
+
+
 def test_slot_posts_leave_the_gap_free() -> None:
     slot = Slot(x=0.3, y=0.1, yaw=0.5, gap=0.024, width=0.09, thickness=0.012, height=0.1)
     up = np.array([0.0, 0.0, 0.05])
@@ -218,14 +273,19 @@ def test_a_large_goal_is_thinned_evenly() -> None:
     assert counts.min() > 0.5 * counts.max()
 
 
-def test_weights_of_zero_leave_costs_out_and_passage_needs_a_slot() -> None:
+def test_weights_of_zero_leave_costs_out_and_costs_of_a_slot_need_one() -> None:
     body, config = line_body(row(5, 0.1)), settings()
     chosen = dataclasses.replace(config, costs=CostConfig(collision=0.0, stretch=0.0))
     names = {c.name for c in make_objective(body, Scene(), row(5, 0.1), chosen).costs}
     assert names == {"goal", "smoothness", "workspace"}
-    with pytest.raises(ConfigError, match="needs a slot"):
-        make_objective(body, Scene(), row(5, 0.1), dataclasses.replace(config, costs=CostConfig(passage=1.0)))
+    asking = dataclasses.replace(config, costs=CostConfig(passage=1.0, through=1.0))
+    for one in ("passage", "through"):
+        only = dataclasses.replace(config, costs=CostConfig(**{one: 1.0}))
+        with pytest.raises(ConfigError, match=f"costs.{one} needs a slot"):
+            make_objective(body, Scene(), row(5, 0.1), only)
     slotted = dataclasses.replace(config, slot=Slot())
+    both = make_objective(body, Scene(), row(5, 0.1), dataclasses.replace(asking, slot=Slot())).costs
+    assert {"passage", "through"} < {c.name for c in both}
     assert len(scene_with_slot(Scene(), slotted).fixtures) == 2
 
 

@@ -56,6 +56,7 @@ class CostConfig:
     workspace: float = setting(10.0, unit="1/m", low=0.0, high=1e6, doc="way of the gripper out of its box")
     stretch: float = setting(1.0, unit="", low=0.0, high=1e6, doc="strain beyond max_strain")
     passage: float = setting(0.0, unit="1/m", low=0.0, high=1e6, doc="of a line that crosses a slot beside its gap")
+    through: float = setting(0.0, unit="", low=0.0, high=1e6, doc="of a line not through a slot as its goal is")
     max_strain: float = setting(0.05, unit="", low=0.0, high=10.0, doc="strain of a spring that costs nothing")
     margin: float = setting(0.003, unit="m", low=0.0, high=0.2, doc="the object keeps this far from fixtures")
     hand_margin: float = setting(0.003, unit="m", low=0.0, high=0.2, doc="hands keep this far from fixtures")

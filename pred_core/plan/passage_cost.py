@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,30 +16,32 @@ from pred_core.types import Body
 BELOW = 0.01  # [m] under the posts' top edge, so that the line cannot slip out
 
 
-class PassageCost:
-    """`weight` x distance of the farthest crossing from the gap's opening [m], mean over the looked-at steps.
+@dataclass(frozen=True)
+class Crossings:
+    """Where lines cross the plane in the middle of the posts; leading axes (...) are steps and motions."""
 
-    The opening reaches from the foot to 1 cm below the top, narrowed by the line's radius on both sides. A line that
-    does not cross the plane costs nothing: the goal makes it cross.
-    """
+    through: Tensor  # (..., N) [m] of the particles in order, beyond the plane along the way through the gap
+    share: Tensor  # (..., N - 1) of each segment that lies before its crossing
+    crosses: Tensor  # (..., N - 1) bool
+    off: Tensor  # (...) [m] of the farthest crossing from the gap's opening; 0 without any
 
-    name = "passage"
 
-    def __init__(self, slot: Slot, body: Body, weight: float):
+class SlotLine:
+    """A line and a slot. The opening reaches from the foot to 1 cm below the top, narrowed by the line's radius."""
+
+    def __init__(self, slot: Slot, body: Body):
         """Raises: ConfigError unless the body is a line."""
         if body.kind != "line":
-            raise ConfigError("the passage cost", got=f"a body of kind {body.kind}", allowed="a line")
+            raise ConfigError("a cost of the slot", got=f"a body of kind {body.kind}", allowed="a line")
         self._order = torch.as_tensor(np.argsort(body.arc, kind="stable"), dtype=torch.long)
         self._axes = torch.as_tensor(slot.axes, dtype=torch.float32)
         self._foot = torch.as_tensor(slot.foot, dtype=torch.float32)
         self._half = max(0.5 * slot.gap - body.radius, 0.0)
         self._top = slot.height - BELOW
-        self._weight = weight
 
-    def __call__(self, rollouts: Rollouts) -> Tensor:
-        """(K,)."""
-        x = rollouts.position[list(rollouts.frames)]
-        x = x.index_select(-2, self._order.to(x.device))
+    def crossings(self, position: Tensor) -> Crossings:
+        """Of particles (..., N, 3) [m] world."""
+        x = position.index_select(-2, self._order.to(position.device))
         local = (x - self._foot.to(x.device)) @ self._axes.to(x.device).T  # through, across, up
         a, b = local[..., :-1, :], local[..., 1:, :]
         crosses = (a[..., 0] < 0.0) != (b[..., 0] < 0.0)
@@ -47,4 +51,21 @@ class PassageCost:
         beside = (at[..., 1].abs() - self._half).clamp_min(0.0)
         above = (at[..., 2] - self._top).clamp_min(0.0)
         off = torch.where(crosses, torch.hypot(beside, above), torch.zeros_like(beside))
-        return self._weight * off.amax(-1).mean(0)
+        return Crossings(local[..., 0], share, crosses, off.amax(-1))
+
+
+class PassageCost:
+    """`weight` x distance of the farthest crossing from the gap's opening [m], mean over the looked-at steps.
+
+    A line that does not cross the plane costs nothing here: the goal, and through_cost.py, make it cross.
+    """
+
+    name = "passage"
+
+    def __init__(self, slot: Slot, body: Body, weight: float):
+        """Raises: ConfigError unless the body is a line."""
+        self._line, self._weight = SlotLine(slot, body), weight
+
+    def __call__(self, rollouts: Rollouts) -> Tensor:
+        """(K,)."""
+        return self._weight * self._line.crossings(rollouts.position[list(rollouts.frames)]).off.mean(0)

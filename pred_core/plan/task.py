@@ -21,6 +21,7 @@ from pred_core.plan.motion_costs import SmoothnessCost, WorkspaceCost
 from pred_core.plan.passage_cost import PassageCost
 from pred_core.plan.planner import Planner, Watch
 from pred_core.plan.stretch_cost import StretchCost
+from pred_core.plan.through_cost import ThroughCost
 from pred_core.pred import with_residual
 from pred_core.springmass import SpringMass
 from pred_core.twin import Twin
@@ -52,7 +53,7 @@ def planning_dynamics(twin: Twin, scene: Scene, device: str = "cpu") -> Dynamics
 def make_objective(body: Body, scene: Scene, goal: Array, config: PlannerConfig) -> Objective:
     """Every cost whose weight is not 0. `scene`: with its slot. goal (Q, 3) [m] world.
 
-    Raises: InputError for an unusable goal (goal.py); ConfigError for a passage cost without a slot.
+    Raises: InputError for an unusable goal (goal.py); ConfigError for a cost of the slot without one.
     """
     c, m = config.costs, config.motion
     low, high = np.array([m.x_low, m.y_low, m.z_low]), np.array([m.x_high, m.y_high, m.z_high])
@@ -70,10 +71,13 @@ def make_objective(body: Body, scene: Scene, goal: Array, config: PlannerConfig)
         costs.append(WorkspaceCost(low, high, c.workspace))
     if c.stretch > 0.0:
         costs.append(StretchCost(body, c.stretch, c.max_strain))
-    if c.passage > 0.0:
-        if config.slot is None:
-            raise ConfigError("costs.passage needs a slot", got="slot: null", next_step="Give 'slot' or weight 0")
+    for name, weight in (("passage", c.passage), ("through", c.through)):
+        if weight > 0.0 and config.slot is None:
+            raise ConfigError(f"costs.{name} needs a slot", got="slot: null", next_step="Give 'slot' or weight 0")
+    if c.passage > 0.0 and config.slot is not None:
         costs.append(PassageCost(config.slot, body, c.passage))
+    if c.through > 0.0 and config.slot is not None:
+        costs.append(ThroughCost(config.slot, body, points, c.through))
     return Objective(costs)
 
 
