@@ -33,7 +33,7 @@ reroute: $(STAMP)
 	$(BIN)/python -m pred_ros.reroute $(ARGS)
 
 test: lint
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -rs
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

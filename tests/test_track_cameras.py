@@ -115,7 +115,7 @@ def test_bad_requests_are_named(world: tuple[Any, Any]) -> None:
 
 
 def test_missing_egl_names_the_package(world: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    egl = pytest.importorskip("mujoco.egl")
+    egl = pytest.importorskip("mujoco.egl", reason="no libEGL here", exc_type=ImportError)
 
     def broken(width: int, height: int) -> None:
         raise ImportError("Cannot initialize a EGL device display")

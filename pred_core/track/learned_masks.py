@@ -88,17 +88,17 @@ class MaskFollower:
             input_boxes=[[box.tolist()]],
             original_size=inputs.original_sizes[0],
         )
-        return self._run(inputs)
+        return self._run(inputs, rgb.shape[:2])
 
     def follow(self, rgb: Picture) -> Mask:
         """The mask (H, W) in the next picture. Raises: ConfigError before `start`."""
         if self._session is None:
             raise ConfigError("SAM 2: no object yet", next_step="Call start with a box first")
-        return self._run(self._processor(images=rgb, device=self._device, return_tensors="pt"))
+        return self._run(self._processor(images=rgb, device=self._device, return_tensors="pt"), rgb.shape[:2])
 
-    def _run(self, inputs: Any) -> Mask:
+    def _run(self, inputs: Any, size: tuple[int, ...]) -> Mask:
+        """The mask of a picture of `size` (height, width): plain numbers, as every version of the package takes."""
         with torch.no_grad():
             outputs = self._model(inference_session=self._session, frame=inputs.pixel_values[0])
-        sizes = [inputs.original_sizes[0]]
-        masks = self._processor.post_process_masks([outputs.pred_masks], original_sizes=sizes, binarize=True)[0]
+        masks = self._processor.post_process_masks([outputs.pred_masks], original_sizes=[size], binarize=True)[0]
         return np.asarray(masks[0, 0].cpu().numpy(), bool)
