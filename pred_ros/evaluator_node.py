@@ -31,7 +31,6 @@ from pred_ros.live_report import stage_name, write_results
 from pred_ros.shell import Shell
 
 UNNAMED = "prediction"  # the model, if neither `model` nor `twin` says more
-REFUSED_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,6 @@ class EvaluatorNode(Shell):
     def __init__(self) -> None:
         super().__init__()
         self._inputs: list[Subscription] = []
-        self._refused = ""
         self._begin_anew()
 
     def setup(self) -> None:
@@ -111,9 +109,8 @@ class EvaluatorNode(Shell):
         self.diagnostics.value("prediction/points", str(predictions))
         self.diagnostics.value("pairs", str(self._scorer.pairs))
         self.diagnostics.value("episodes released", str(self._scorer.released))
-        refused_age = self.diagnostics.age("refused message")
-        if refused_age is not None and refused_age < REFUSED_SHOWN:
-            self.report(ERROR, self._refused)
+        if self.refusal:
+            self.report(ERROR, self.refusal)
         elif not self._scorer.pairs:
             self.report(WARN, f"no pairs yet ({points} measured, {predictions} predicted frames)")
         elif math.isfinite(mde) and not self._written:
@@ -143,7 +140,7 @@ class EvaluatorNode(Shell):
         try:
             mark = marks.decode(message.data)
         except PredError as error:
-            self._refuse(error)
+            self.refuse(error)
             return
         if isinstance(mark, marks.EndMark):
             self._ended = mark
@@ -152,29 +149,21 @@ class EvaluatorNode(Shell):
         self._news = time.monotonic()
 
     def _on_points(self, message: PointCloud2) -> None:
-        self.diagnostics.seen(TRACKER_POINTS)
-        try:
-            frame = convert.cloud_to_points(message)
-            true = self._calibration.correct_points(frame.position)
-            self._scorer.add_points(dataclasses.replace(frame, position=true))
-            self._news = time.monotonic()
-        except PredError as error:
-            self._refuse(error)
+        self.take(TRACKER_POINTS, self._add_points, message)
+
+    def _add_points(self, message: PointCloud2) -> None:
+        frame = convert.cloud_to_points(message)
+        true = self._calibration.correct_points(frame.position)
+        self._scorer.add_points(dataclasses.replace(frame, position=true))
+        self._news = time.monotonic()
 
     def _on_prediction(self, message: PointCloud2) -> None:
-        self.diagnostics.seen(PREDICTION_POINTS)
-        try:
-            stamp, ids, state = convert.cloud_to_state(message, PREDICTION_POINTS)
-            self._scorer.add_prediction(stamp, ids, state.position.double().numpy())
-            self._news = time.monotonic()
-        except PredError as error:
-            self._refuse(error)
+        self.take(PREDICTION_POINTS, self._add_prediction, message)
 
-    def _refuse(self, error: PredError) -> None:
-        self._refused = f"refused: {error}"
-        self.diagnostics.seen("refused message")
-        self.diagnostics.count("refused messages")
-        self.report(ERROR, self._refused)
+    def _add_prediction(self, message: PointCloud2) -> None:
+        stamp, ids, state = convert.cloud_to_state(message, PREDICTION_POINTS)
+        self._scorer.add_prediction(stamp, ids, state.position.double().numpy())
+        self._news = time.monotonic()
 
 
 def main() -> NoReturn:

@@ -43,7 +43,6 @@ from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.shell import Shell
 
 KEPT_POSES = 2.0  # [s] of gripper poses, to find the one at a state's stamp
-REFUSED_SHOWN = 2.0  # [s] how long a refusal stays the headline of the diagnostics
 SAMPLES_SHOWN = 64  # motions in the markers
 
 
@@ -80,7 +79,6 @@ class PlannerNode(Shell):
         self._goal: PointCloud2 | None = None
         self._poses: deque[PoseFrame] = deque()
         self._ending = self._enabled = self._latched = self._stop_asked = self._reset_asked = False
-        self._refused = ""
 
     def setup(self) -> None:
         """Load the twin and the settings, make publishers and services."""
@@ -118,7 +116,7 @@ class PlannerNode(Shell):
             self.create_subscription(PoseArray, GRIPPER_POSE, self._on_pose, qos.poses_live()),
             self.create_subscription(PointCloud2, STATE_POINTS, self._on_state, qos.points_live()),
         ]
-        self._watch = self.create_timer(0.05, self._check_worker)
+        self._watch = self.create_timer(0.05, lambda: self.check_worker(self._worker))
 
     def stop(self) -> None:
         """End the worker; what was sent is carried out to its stop."""
@@ -145,9 +143,8 @@ class PlannerNode(Shell):
         counts = self._session.counts
         for name, count in vars(counts).items():
             self.diagnostics.value(f"count: {name}", str(count))
-        refused_age = self.diagnostics.age("refused message")
-        if refused_age is not None and refused_age < REFUSED_SHOWN:
-            self.report(ERROR, self._refused)
+        if self.refusal:
+            self.report(ERROR, self.refusal)
             return
         for topic in (GOAL_POINTS, STATE_POINTS, GRIPPER_POSE):
             age = self.diagnostics.age(topic)
@@ -181,12 +178,10 @@ class PlannerNode(Shell):
         self._wake(_state=(number, message))
 
     def _on_pose(self, message: PoseArray) -> None:
-        self.diagnostics.seen(GRIPPER_POSE)
-        try:
-            pose = convert.message_to_pose(message)
-        except PredError as error:
-            self._refuse(error)
-            return
+        self.take(GRIPPER_POSE, self._add_pose, message)
+
+    def _add_pose(self, message: PoseArray) -> None:
+        pose = convert.message_to_pose(message)
         with self._changed:
             if self._poses and pose.stamp < self._poses[-1].stamp:  # a new run, or a clock set back
                 self._poses.clear()
@@ -218,20 +213,6 @@ class PlannerNode(Shell):
                 setattr(self, name, value)
             self._changed.notify()
 
-    def _check_worker(self) -> None:
-        if self._worker is None or not self._worker.done():
-            return
-        try:
-            self._worker.result()  # a bug ends the process with its trace
-        except PredError as error:
-            self.fail(error)
-
-    def _refuse(self, error: PredError) -> None:
-        self._refused = f"refused: {error}"
-        self.diagnostics.seen("refused message")
-        self.diagnostics.count("refused messages")
-        self.report(ERROR, self._refused)
-
     # Below: the worker thread. It alone touches the Session.
 
     def _work(self) -> None:
@@ -259,7 +240,7 @@ class PlannerNode(Shell):
             except TwinError:
                 raise
             except PredError as error:
-                self._refuse(error)
+                self.refuse(error)
 
     def _has_work(self, last: int) -> bool:
         fresh = self._enabled and self._state is not None and self._state[0] != last

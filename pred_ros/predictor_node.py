@@ -39,7 +39,6 @@ from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.shell import Shell
 
 KEPT = 8  # newest messages that survive an overload: four frames with their poses, enough for a start
-REFUSED_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
 COUNTS_SHOWN = ("runs", "steps", "interpolated", "unused_poses", "gaps", "jumps", "dropped_frames", "dropped_poses")
 OVERLOAD_SHOWN = 5.0  # [s] how long dropped messages do
 
@@ -110,7 +109,7 @@ class PredictorNode(Shell):
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="prediction")
         self._inputs: list[Subscription] = []
         self._closed: NDArray[np.bool_] | None = None
-        self._refused = self._overload = ""
+        self._overload = ""
         self._stopping = False
 
     def setup(self) -> None:
@@ -154,7 +153,7 @@ class PredictorNode(Shell):
         self._stopping = False
         self._worker = self._pool.submit(self._work)
         self._starter = self.create_timer(0.02, self._subscribe_when_heard)
-        self._watch = self.create_timer(0.05, self._check_worker)
+        self._watch = self.create_timer(0.05, lambda: self.check_worker(self._worker))
 
     def stop(self) -> None:
         """End the worker; what waits in the inbox is not predicted any more."""
@@ -190,13 +189,12 @@ class PredictorNode(Shell):
         trouble = self._show_condition()
         self.diagnostics.value("waiting inbox", str(self._inbox.qsize()))
         age, frame_age = self.diagnostics.age(GRIPPER_POSE), self.diagnostics.age(TRACKER_POINTS)
-        refused_age = self.diagnostics.age("refused message")
         overload_age = self.diagnostics.age("dropped messages")
         limit = max(self.config.max_gap, 0.2)
         if self._predictor.halted is not None:
             self.report(ERROR, str(self._predictor.halted))
-        elif refused_age is not None and refused_age < REFUSED_SHOWN:
-            self.report(ERROR, self._refused)
+        elif self.refusal:
+            self.report(ERROR, self.refusal)
         elif overload_age is not None and overload_age < OVERLOAD_SHOWN:
             self.report(WARN, self._overload)
         elif age is None or age > limit:
@@ -235,42 +233,20 @@ class PredictorNode(Shell):
         ]
         self._starter.cancel()
 
-    def _check_worker(self) -> None:
-        if self._worker is None or not self._worker.done():
-            return
-        try:
-            self._worker.result()  # raises what ended the worker; a bug ends the process with its trace
-        except PredError as error:
-            self.fail(error)
-
     def _on_closed(self, message: UInt8MultiArray) -> None:
-        self._take(GRIPPER_CLOSED, lambda: self._set_closed(convert.message_to_closed(message)))
+        self.take(GRIPPER_CLOSED, lambda: self._set_closed(convert.message_to_closed(message)))
 
     def _on_pose(self, message: PoseArray) -> None:
-        self._take(GRIPPER_POSE, lambda: self._post(self._add_pose, convert.message_to_pose(message), self._closed))
+        self.take(GRIPPER_POSE, lambda: self._post(self._add_pose, convert.message_to_pose(message), self._closed))
 
     def _on_points(self, message: PointCloud2) -> None:
-        self._take(TRACKER_POINTS, lambda: self._post(self._add_points, convert.cloud_to_points(message)))
+        self.take(TRACKER_POINTS, lambda: self._post(self._add_points, convert.cloud_to_points(message)))
 
     def _set_closed(self, closed: NDArray[np.bool_]) -> None:
         self._closed = closed
 
     def _post(self, action: Callable[..., None], *values: object) -> None:
         self._inbox.put(lambda: action(*values))
-
-    def _take(self, topic: str, action: Callable[[], None]) -> None:
-        self.diagnostics.seen(topic)
-        self.diagnostics.count(f"messages on {topic}")
-        try:
-            action()
-        except PredError as error:
-            self._refuse(error)
-
-    def _refuse(self, error: PredError) -> None:
-        self._refused = f"refused: {error}"
-        self.diagnostics.seen("refused message")
-        self.diagnostics.count("refused messages")
-        self.report(ERROR, self._refused)
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._post(self._reset)
@@ -290,7 +266,7 @@ class PredictorNode(Shell):
                 self.diagnostics.count("divergences")
                 self.report(ERROR, str(error))
             except PredError as error:
-                self._refuse(error)
+                self.refuse(error)
 
     def _reset(self) -> None:
         self._predictor.reset()

@@ -10,6 +10,8 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn, Protocol, cast
 
@@ -32,6 +34,8 @@ from pred_ros.processes import END_WITH_PARENT
 
 BAD_INPUT = 2
 POLL = 0.05  # [s] how soon a signal or the end of the work is noticed
+REFUSAL_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
+REFUSED = "refused message"
 
 
 class NodeConfig(Protocol):
@@ -68,6 +72,7 @@ class Shell(LifecycleNode):
         parameters.follow(self, lambda: self.config, self._accept)
         self.exit_code: int | None = None
         self.bug: BaseException | None = None
+        self._refusal = ""
         self.diagnostics = Diagnostics(self.get_fully_qualified_name(), self.seconds)
         self._diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._timer = self.create_timer(1.0, self._heartbeat)
@@ -114,6 +119,37 @@ class Shell(LifecycleNode):
         """[s] For ages and deadlines: simulated time where there is one, it may be slower than the wall's."""
         clock: Any = self.get_clock()
         return clock.now().nanoseconds * 1e-9 if clock.ros_time_is_active else time.monotonic()
+
+    def take(self, topic: str, action: Callable[..., None], *values: Any) -> None:
+        """Count a message of a topic and act on it; what cannot be used is refused, and the node goes on."""
+        self.diagnostics.seen(topic)
+        self.diagnostics.count(f"messages on {topic}")
+        try:
+            action(*values)
+        except PredError as error:
+            self.refuse(error)
+
+    def refuse(self, error: PredError) -> None:
+        """Say that a message was refused."""
+        self._refusal = f"refused: {error}"
+        self.diagnostics.seen(REFUSED)
+        self.diagnostics.count("refused messages")
+        self.report(ERROR, self._refusal)
+
+    @property
+    def refusal(self) -> str:
+        """The newest refusal while it is the headline of the diagnostics, else ''."""
+        age = self.diagnostics.age(REFUSED)
+        return self._refusal if age is not None and age < REFUSAL_SHOWN else ""
+
+    def check_worker(self, worker: Future[None] | None) -> None:
+        """End the process if its worker thread has ended: with one line on bad input, with its trace on a bug."""
+        if worker is None or not worker.done():
+            return
+        try:
+            worker.result()
+        except PredError as error:
+            self.fail(error)
 
     def fail(self, error: PredError) -> None:
         """End the process with one clear line."""

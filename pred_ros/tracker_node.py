@@ -37,9 +37,8 @@ from pred_core.types import Box
 from pred_ros import convert, qos, shell
 from pred_ros.camera_pairs import CameraPairs
 from pred_ros.diagnostics import ERROR, OK, WARN
-from pred_ros.shell import Shell
+from pred_ros.shell import REFUSAL_SHOWN, Shell
 
-REFUSED_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
 SILENT = 1.0  # [s] without a picture before a camera counts as dead
 GAP, GAP_TIMES = 0.25, 2.5  # [s], usual times between pictures: a longer silence of all cameras is said afterwards
 
@@ -125,7 +124,6 @@ class TrackerNode(Shell):
         self._lock = threading.Lock()  # guards what callbacks hand to the worker
         self._news: list[Callable[[Tracker], None]] = []
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
-        self._refused = ""
         self._status = "searching"
         self._odd: tuple[str, float] | None = None
         self._slipped = False
@@ -156,13 +154,13 @@ class TrackerNode(Shell):
                 (CameraInfo, images.INFO, qos_profile_sensor_data, self._pairs.add_info),
                 (PoseStamped, images.POSE, qos.latched(), self._pairs.add_pose),
             ):
-                callback = functools.partial(self._take, f"{name}/{topic}", functools.partial(add, name))
+                callback = functools.partial(self.take, f"{name}/{topic}", functools.partial(add, name))
                 self._listen(message_type, f"{name}/{topic}", callback, profile)
         self._listen(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed, qos.points_live())
         self._listen(PoseArray, GRIPPER_POSE, self._on_pose, qos.poses_live())
         if self.config.prior:
             self._listen(PointCloud2, STATE_POINTS, self._on_state, qos.points_live())
-        self._watch = self.create_timer(0.05, self._check_worker)
+        self._watch = self.create_timer(0.05, lambda: self.check_worker(self._worker))
 
     def stop(self) -> None:
         """End the worker."""
@@ -193,14 +191,14 @@ class TrackerNode(Shell):
             return
         self.diagnostics.value("pictures dropped, newer came", str(self._pairs.dropped))
         silent = self._pairs.silent(SILENT)
-        refused_age, gap_age = self.diagnostics.age("refused message"), self.diagnostics.age("last gap")
-        if refused_age is not None and refused_age < REFUSED_SHOWN:
-            self.report(ERROR, self._refused)
+        gap_age = self.diagnostics.age("last gap")
+        if self.refusal:
+            self.report(ERROR, self.refusal)
         elif len(silent) == len(self._names):
             self.report(ERROR, f"no pictures of {', '.join(silent)}: nothing is tracked")
         elif self._status != "tracking":
             self.report(WARN, f"{self._status}: the object is not in view, or is not a {self.config.kind}")
-        elif gap_age is not None and gap_age < REFUSED_SHOWN:
+        elif gap_age is not None and gap_age < REFUSAL_SHOWN:
             self.report(WARN, self._gap)
         elif self._slipped:
             self.report(WARN, "tracking; the object has slipped out of the gripper")
@@ -215,22 +213,18 @@ class TrackerNode(Shell):
     def _listen(self, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any) -> None:
         self._inputs.append(self.create_subscription(kind, topic, callback, profile))
 
-    def _check_worker(self) -> None:
-        if self._worker is not None and self._worker.done():
-            self._worker.result()  # raises the bug that ended the worker; the process ends with its trace
-
     def _on_image(self, name: str, kind: str, message: Image) -> None:
         self.diagnostics.seen(f"{name} {kind}")
         self._pairs.add_image(name, kind, message)
 
     def _on_closed(self, message: UInt8MultiArray) -> None:
-        self._take(GRIPPER_CLOSED, self._set_closed, message)
+        self.take(GRIPPER_CLOSED, self._set_closed, message)
 
     def _set_closed(self, message: UInt8MultiArray) -> None:
         self._closed = convert.message_to_closed(message)
 
     def _on_pose(self, message: PoseArray) -> None:
-        self._take(GRIPPER_POSE, self._add_pose, message)
+        self.take(GRIPPER_POSE, self._add_pose, message)
 
     def _add_pose(self, message: PoseArray) -> None:
         pose = convert.message_to_pose(message)
@@ -238,7 +232,7 @@ class TrackerNode(Shell):
         self._tell(lambda tracker: tracker.add_grip(pose.stamp, pose.position, pose.rotation, closed))
 
     def _on_state(self, message: PointCloud2) -> None:
-        self._take(STATE_POINTS, self._add_state, message)
+        self.take(STATE_POINTS, self._add_state, message)
 
     def _add_state(self, message: PointCloud2) -> None:
         stamp, ids, state = convert.cloud_to_state(message, STATE_POINTS)
@@ -255,20 +249,6 @@ class TrackerNode(Shell):
         with self._lock:
             self._news.append(action)
 
-    def _take(self, topic: str, action: Callable[[Any], None], message: Any) -> None:
-        self.diagnostics.seen(topic)
-        self.diagnostics.count(f"messages on {topic}")
-        try:
-            action(message)
-        except PredError as error:
-            self._refuse(error)
-
-    def _refuse(self, error: PredError) -> None:
-        self._refused = f"refused: {error}"
-        self.diagnostics.seen("refused message")
-        self.diagnostics.count("refused messages")
-        self.report(ERROR, self._refused)
-
     # Below: the worker thread. It alone touches the Tracker.
 
     def _work(self) -> None:
@@ -280,12 +260,12 @@ class TrackerNode(Shell):
                 for action in news:
                     action(self._tracker)
             except PredError as error:
-                self._refuse(error)
+                self.refuse(error)
             for name, pair in pairs.items():
                 try:
                     self._tracker.add_frame(name, self._pairs.picture(name, pair))
                 except PredError as error:
-                    self._refuse(error)
+                    self.refuse(error)
             estimate = self._tracker.step()
             self._status = "searching" if estimate is None else estimate.status
             if estimate is not None:
