@@ -9,7 +9,7 @@ import pytest
 from report_cases import judged, rope
 
 from pred_core.diagnose import evidence
-from pred_core.diagnose.evidence import Judged, family_wise, lack_of_fit, rivals, set_limit, simplest
+from pred_core.diagnose.evidence import Judged, elsewhere, family_wise, lack_of_fit, rivals, set_limit, simplest
 from pred_core.diagnose.progress import Named, refitted
 from pred_core.diagnose.ranking import nothing
 from pred_core.diagnose.trial import make_trial
@@ -181,3 +181,12 @@ def test_nothing_is_the_less_likely_the_nearer_a_candidate_came_to_a_name() -> N
     assert nothing(0.05) == pytest.approx(1.0 / 1.751, abs=2e-3)
     values = [nothing(p) for p in (1e-9, 0.01, 0.05, 0.1, 0.3, 1.0)]
     assert values == sorted(values) and 0.0 < values[0] < 0.01
+
+
+def test_causes_that_save_in_other_episodes_are_not_two_names_for_one(twin: Twin) -> None:
+    """Drag saves 4, 4, 0.2, 0: shares 0.49, 0.49, 0.02, 0. A table saves 0, 0, 3, 3: they share 0.02. Wind shares 0.98.
+    By the spread of the differences, 4 and -3, the table could not be told apart from the drag.
+    """
+    drag, table, wind = gains(twin, np.array([[4.0, 4.0, 0.2, 0.0], [0.0, 0.0, 3.0, 3.0], [3.9, 3.9, 0.2, -1.0]]))
+    assert rivals([table], drag)[0][1] < set_limit(4)
+    assert elsewhere(table, drag) and elsewhere(drag, table) and not elsewhere(wind, drag)

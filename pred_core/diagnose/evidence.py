@@ -20,6 +20,7 @@ ACTS = 0.1  # standard deviations of a residual by which a cause must move an ep
 NESTED = 0.03  # of the best gain: with fewer parameters, so little less is the better name
 SIMILAR = 0.1  # the same where it is also within one standard error
 CONFIDENCE = 0.90  # of the set of causes that cannot be told apart
+SHARED = 0.3  # overlap of where two candidates save: of one cause under two names 0.5 to 1, of drag and a table 0.1
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,14 @@ def rivals(judged: Sequence[Judged], best: Judged) -> list[tuple[Judged, float]]
         error = float(difference.std(ddof=1)) / np.sqrt(len(difference))
         rows.append((other, float(difference.mean()) / error if error > 0 else 0.0))
     return sorted(rows, key=lambda row: row[1])
+
+
+def elsewhere(one: Judged, other: Judged) -> bool:
+    """Whether the two save in other episodes: then they are two causes, and not two names for one."""
+    saved = [np.maximum(j.gain, 0.0) for j in (one, other)]
+    if any(s.sum() == 0.0 for s in saved):
+        return False
+    return float(np.minimum(*(s / s.sum() for s in saved)).sum()) < SHARED
 
 
 def set_limit(episodes: int) -> float:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pred_core.diagnose.evidence import FEWEST_GROUPS, Judged, family_wise, rivals, set_limit, simplest
+from pred_core.diagnose.evidence import FEWEST_GROUPS, Judged, elsewhere, family_wise, rivals, set_limit, simplest
 from pred_core.diagnose.judge import Bench
 from pred_core.diagnose.progress import Named, Progress
 
@@ -51,7 +51,10 @@ def choose(
     near = [
         o
         for o, z in rivals([r[0] for r in accepted], chosen)
-        if o is not chosen and z < limit and not (o.parameters > chosen.parameters and not much_better(o, chosen))
+        if o is not chosen
+        and z < limit
+        and not elsewhere(o, chosen)
+        and not (o.parameters > chosen.parameters and not much_better(o, chosen))
     ]
     q = next(row[1] for row in accepted if row[0] is chosen)
     closed = share_closed(chosen, progress, excess, floor)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from pred_core.diagnose.evidence import rivals
+from pred_core.diagnose.evidence import elsewhere, rivals
 from pred_core.diagnose.gate import GateResult
 from pred_core.diagnose.progress import Named, Progress, Round
 from pred_core.diagnose.result import Ranked
@@ -86,7 +86,8 @@ def _finalists(first: Round, chosen: Named | None, sure: float) -> list[Ranked]:
     excess = max(whole - first.floor, 0.05 * whole, 1e-9)
     judged = [j for j, _, _ in first.judged]
     best = chosen.judged if chosen else min(judged, key=lambda j: j.left)
-    weight = {j.trial.id: math.exp(-SHARP * max(z, 0.0)) for j, z in rivals(judged, best)}
+    apart = {j.trial.id for j in judged if elsewhere(j, best)}
+    weight = {j.trial.id: math.exp(-SHARP * max(z, 0.0)) for j, z in rivals(judged, best) if j.trial.id not in apart}
     p = {j.trial.id: (q, why) for j, q, why in first.judged}
     allowed = {k: w for k, w in weight.items() if not p[k][1] or (chosen is not None and k == best.trial.id)}
     total = sum(allowed.values()) or 1.0
@@ -97,14 +98,17 @@ def _finalists(first: Round, chosen: Named | None, sure: float) -> list[Ranked]:
             probability=sure * allowed.get(j.trial.id, 0.0) / total,
             gain=j.mean / excess,
             p_adjusted=p[j.trial.id][0],
-            rejected=_why(j.trial.id, p[j.trial.id][1], chosen, best.trial.id),
+            rejected=_why(j.trial.id, p[j.trial.id][1], chosen, j.trial.id in apart),
             values=j.values,
         )
         for j in judged
     ]
 
 
-def _why(id: str, why: str, chosen: Named | None, best: str) -> str:
-    if why or chosen is None or id == best:
+def _why(id: str, why: str, chosen: Named | None, apart: bool) -> str:
+    if why or chosen is None or id == chosen.judged.trial.id:
         return why
+    best = chosen.judged.trial.id
+    if apart:
+        return f"saves in other episodes than {best}: a cause besides it, if it is one"
     return f"these data do not tell it apart from {best}" if id in chosen.group else f"saves less than {best}"
