@@ -26,7 +26,7 @@ from track_scenes import LENGTH, STEP, TURN, HangingRope
 from pred_core.bag import images
 from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
-from pred_core.bag.wire import TRACKER_POINTS
+from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
 from pred_core.errors import ConfigError
 from pred_core.types import CameraFrame
 from pred_ros import convert, qos
@@ -78,14 +78,33 @@ class Rig:
 
     def all(self, stamp: int, **changes: Any) -> None:
         """Gripper and both cameras at one stamp."""
-        self.bench.closed_out.publish(convert.closed_to_message(np.array([True])))
-        self.bench.pose_out.publish(convert.pose_to_message(PoseFrame(stamp, self.scene.gripper[None], TURN)))
+        self.close()
+        self.hold(stamp)
         for name, frame in self.scene.frames(stamp).items():
             self.calibrate(frame, name)
             self.show(dataclasses.replace(frame, **changes), name)
 
+    def close(self) -> None:
+        """Say that the gripper is closed."""
+        self.bench.closed_out.publish(convert.closed_to_message(np.array([True])))
+
+    def hold(self, stamp: int) -> None:
+        """Say where the gripper is."""
+        self.bench.pose_out.publish(convert.pose_to_message(PoseFrame(stamp, self.scene.gripper[None], TURN)))
+
+    def until_held(self) -> None:
+        """Before the first picture, the gripper must have been heard: it says which end is the first."""
+        before = functools.partial(self.hold, START - STEP)
+        for topic, say in ((GRIPPER_CLOSED, self.close), (GRIPPER_POSE, before)):
+            self.bench.until(functools.partial(self._heard, f"messages on {topic}", say), topic)
+
+    def _heard(self, counter: str, say: Callable[[], None]) -> bool:
+        say()
+        return self.bench.node.diagnostics.counter(counter) > 0
+
     def until_found(self) -> None:
         """Show pictures until particles come; the first ones may arrive before their calibration."""
+        self.until_held()
         for k in range(40):
             count = len(self.frames)
             self.all(START + k * STEP)
