@@ -7,18 +7,17 @@ what is missing, runs player, predictor and evaluator, then `pred evaluate` for 
 from __future__ import annotations
 
 import argparse
-import signal
 import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
 
 from pred_core.bag.dataset import FILE, load_dataset
 from pred_core.bag.measured import find_measured
-from pred_core.cli.main import BAD_INPUT, INTERRUPTED
+from pred_core.cli.main import INTERRUPTED
 from pred_core.errors import PredError
+from pred_ros.commands import run_command
 from pred_ros.live import Replay, replay
 from pred_ros.resources import config_folder, sample_dataset
 
@@ -39,27 +38,11 @@ class Source:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point. Returns 0 done, 2 bad input, 130 interrupted."""
     args = _parser().parse_args(argv)
-    before = signal.signal(signal.SIGTERM, _interrupt)
-    try:
-        run(args)
-    except PredError as error:
-        print(f"pred_replay: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("pred_replay: interrupted; nothing is left running", file=sys.stderr)
-        return INTERRUPTED
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    return 0
+    return run_command("pred_replay", lambda: run(args))
 
 
-def _interrupt(number: int, frame: object) -> NoReturn:
-    """SIGTERM ends the nodes as Ctrl-C does."""
-    raise KeyboardInterrupt
-
-
-def run(args: argparse.Namespace) -> None:
-    """Choose, prepare, replay, evaluate, and say where everything is. Raises: PredError."""
+def run(args: argparse.Namespace) -> int:
+    """Choose, prepare, replay, evaluate, and say where everything is. Returns 0. Raises: PredError."""
     source = choose_source(args.dataset)
     out = args.out / source.name
     print(f"1. data: {source.name}, {source.origin}: {source.path}", flush=True)
@@ -82,6 +65,7 @@ def run(args: argparse.Namespace) -> None:
     print(f"   live replay   {out / 'live' / 'report.html'}")
     if not args.live_only:
         print(f"   evaluation    {out / 'evaluate' / 'report.html'}")
+    return 0
 
 
 def choose_source(dataset: Path | None) -> Source:

@@ -10,20 +10,18 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
-import signal
 import socket
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
 from pred_core.arm.limits import GuardConfig
-from pred_core.cli.main import BAD_INPUT, INTERRUPTED
 from pred_core.config import from_mapping
-from pred_core.errors import ConfigError, PredError
+from pred_core.errors import ConfigError
 from pred_core.plan.endpoints import read_cloud
 from pred_core.plan.goal import size_of
 from pred_core.plan.task import load_settings
@@ -31,6 +29,7 @@ from pred_core.plant.live.slot import SlotConfig
 from pred_core.twin import Twin
 from pred_core.types import Array
 from pred_ros.bringup import apply_overrides, read_nodes
+from pred_ros.commands import run_command
 from pred_ros.node_parameters import check_parameters
 from pred_ros.reroute_faults import FAULTS, Fault
 from pred_ros.reroute_loop import BAG, Job, run
@@ -49,22 +48,7 @@ SPACING = 0.01  # [m] of the goal's points
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point. Returns 0 done, 1 not reached or not safe, 2 bad input or a node that failed, 130 interrupted."""
     args = _parser().parse_args(argv)
-    before = signal.signal(signal.SIGTERM, _interrupt)
-    try:
-        return go(args)
-    except PredError as error:
-        print(f"pred_reroute: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("pred_reroute: interrupted; nothing is left running", file=sys.stderr)
-        return INTERRUPTED
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def _interrupt(number: int, frame: object) -> NoReturn:
-    """SIGTERM ends the nodes as Ctrl-C does."""
-    raise KeyboardInterrupt
+    return run_command("pred_reroute", lambda: go(args))
 
 
 def go(args: argparse.Namespace) -> int:

@@ -41,15 +41,22 @@ def command(tmp_path: Path) -> list[str]:
     return ["identify", str(tmp_path / "data"), "--out", str(tmp_path / "twin")]
 
 
-def test_the_held_out_error_is_said_to_be_of_the_parameters_before_the_last_refit(
-    found: Identified, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def identified(found: Identified, monkeypatch: pytest.MonkeyPatch) -> Identified:
+    """What the command finds at once, leaving its journal."""
+
     def identify(dataset: object, episodes: object, config: object, journal: Path, *rest: object) -> Identified:
         journal.parent.mkdir(exist_ok=True)
         journal.write_text("{}")
         return found
 
     monkeypatch.setattr(identify_command, "identify", identify)
+    return found
+
+
+def test_the_held_out_error_is_said_to_be_of_the_parameters_before_the_last_refit(
+    identified: Identified, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(command(tmp_path)) == 0
     printed = capsys.readouterr().out
     assert "best 90 % of windows" in printed
@@ -59,22 +66,17 @@ def test_the_held_out_error_is_said_to_be_of_the_parameters_before_the_last_refi
     assert "before the last refit" in stored["definitions"]["error_mm.held_out"]
     assert "before the last refit" in (tmp_path / "twin" / "identify.html").read_text()
     assert not (tmp_path / "twin" / identify_command.JOURNAL).exists()
-    write_report(tmp_path / "none.html", dataclasses.replace(found, held_out_mm=None), "pred identify")
+    write_report(tmp_path / "none.html", dataclasses.replace(identified, held_out_mm=None), "pred identify")
     assert "held out" not in (tmp_path / "none.html").read_text()
 
 
+@pytest.mark.usefixtures("identified")
 def test_the_journal_stays_until_everything_is_written(
-    found: Identified, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def identify(dataset: object, episodes: object, config: object, journal: Path, *rest: object) -> Identified:
-        journal.parent.mkdir(exist_ok=True)
-        journal.write_text("{}")
-        return found
-
     def interrupted(*arguments: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(identify_command, "identify", identify)
     monkeypatch.setattr(identify_command, "write_report", interrupted)
     assert main(command(tmp_path)) == 130
     assert (tmp_path / "twin" / identify_command.JOURNAL).is_file()
