@@ -12,6 +12,7 @@ from pred_core.diagnose.progress import Named, Progress
 
 LEFT = 0.25  # of the floor: an excess that is called unknown if nothing explains it
 FEWEST = 10  # episodes for inference; fewer are exploratory
+HALF = 0.5  # of the least gain: a cause must save so much beside "off" too, whatever the reference says of it
 SLIGHT = 0.05  # of the mean gain: an episode that loses less is not worse
 EXPLORATORY = 0.5  # share of the excess a cause must close to be named from fewer
 BETTER = 0.1  # of the gain of a simpler law that one with more parameters must save beyond it to be its rival
@@ -67,12 +68,15 @@ def much_better(one: Judged, simpler: Judged) -> bool:
 
 
 def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress) -> str:
-    """Why a candidate is not named; "" if it may be."""
+    """Why a candidate is not named; "" if it may be. `excess` of the base's loss over `floor`, below 0 if under it."""
     config = progress.bench.config
     cold = progress.bench.reference is None
     first = progress.rounds[0] if progress.rounds else None
-    whole = excess if first is None or cold else max(float(first.base.mean()) - first.floor, excess)
+    without = floor + excess
+    whole = max(excess, 0.0) if first is None or cold else max(float(first.base.mean()) - first.floor, excess, 0.0)
     least = max((config.cold_gate if cold else config.gate) * whole, STANDING * floor)
+    if without - j.left < HALF * least:  # what it saves beside the reference's value is not saved beside "off"
+        return f"leaves {j.left:.3f} of the loss, where {without:.3f} are left without it"
     better, acting = j.improved
     if exploratory(progress.bench):  # no inference: what helps everywhere, and much, is named as exploratory
         worse = int((j.gain[j.acts] < -SLIGHT * j.mean).sum())

@@ -81,7 +81,7 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
         gain = f"gain {judged[-1].mean:.3f} of {base.mean():.3f}"
         tell(f"round {number + 1}: fitted {n + 1}/{len(finalists)}, {s.trial.id}: {gain}")
     kept = finalists
-    excess = max(float(base.mean()) - floor, 0.0)
+    excess = float(base.mean()) - floor
     found, rows = choose(judged, excess, floor, progress)
     closed = found.closed if found else 0.0
     if (found is None or closed < config.enough) and not progress.late():
