@@ -12,11 +12,15 @@ from numpy.typing import NDArray
 
 from pred_core.bag.dataset import load_dataset
 from pred_core.diagnose.evidence import family_wise
+from pred_core.errors import ConfigError
 from pred_core.types import Array
 
 
 def flips(cases: Sequence[tuple[Path, Path]]) -> list[str]:
-    """Lines about (data set, answer) of controls: their smallest p values, and the intraclass correlation of gains."""
+    """Lines about (data set, answer) of controls: their smallest p values, and the intraclass correlation of gains.
+
+    Raises: ConfigError if no candidate was fitted to any of them, or its journal is gone.
+    """
     alike: list[float] = []
     smallest: list[float] = []
     for dataset, answer in cases:
@@ -26,6 +30,9 @@ def flips(cases: Sequence[tuple[Path, Path]]) -> list[str]:
             continue
         smallest.append(float(family_wise([SimpleNamespace(gain=g) for g in gains], 0, groups).min()))
         alike += [correlation(g, groups) for g in gains if g.std() > 0.0]
+    if not alike:
+        got = f"{len(smallest)} of {len(cases)} with gains of fitted candidates"
+        raise ConfigError("journals of controls", got=got, next_step="Run the cases first, and keep journal.jsonl")
     low = ", ".join(f"{p:.3f}" for p in sorted(smallest)[:5])
     return [
         f"{len(smallest)} controls, smallest p values by sign flips of episodes: {low}",
@@ -35,7 +42,10 @@ def flips(cases: Sequence[tuple[Path, Path]]) -> list[str]:
 
 
 def correlation(values: Array, groups: NDArray[np.int64]) -> float:
-    """Intraclass correlation of values (E,) in groups (E,) of unequal size: one-way analysis of variance."""
+    """Intraclass correlation of values (E,) in groups (E,) of unequal size: one-way analysis of variance.
+
+    (B - W) / (B + (n - 1) W) with the mean squares between and within groups and the usual size n of one (Donner 1986).
+    """
     _, group, size = np.unique(groups, return_inverse=True, return_counts=True)
     mean = np.bincount(group, values) / size
     count, k = len(values), len(size)

@@ -13,6 +13,7 @@ from bench_modules import loaded_modules
 from hidden_answers import MODULES, answer
 
 from pred_core.effects import LIBRARY, find_effect
+from pred_core.errors import ConfigError
 from pred_core.plant.hidden.library import LIBRARY as HIDDEN
 
 
@@ -191,6 +192,19 @@ def test_cases_are_a_function_of_their_seeds(bench: dict[str, ModuleType]) -> No
         for name, magnitude in case.hidden:
             entry = HIDDEN[name]
             assert min(2 * entry.minimum, entry.high) <= magnitude <= min(10 * entry.minimum, entry.high)
+
+
+def test_how_alike_values_of_a_group_are(bench: dict[str, ModuleType]) -> None:
+    """Alike and different from the other group: 1. Groups of the same mean: B = 0, -W / W = -1. Three and one of
+    (0, 2, 4), 2: W = 8 / 2 = 4, B = 0, n = (4 - 10 / 4) / 1 = 1.5, so -4 / (0.5 * 4) = -2.
+    """
+    correlation = bench["hidden_flips"].correlation
+    two = np.array([0, 0, 1, 1])
+    assert correlation(np.array([1.0, 1.0, 3.0, 3.0]), two) == pytest.approx(1.0)
+    assert correlation(np.array([1.0, 3.0, 1.0, 3.0]), two) == pytest.approx(-1.0)
+    assert correlation(np.array([0.0, 2.0, 4.0, 2.0]), np.array([7, 7, 7, 9])) == pytest.approx(-2.0)
+    with pytest.raises(ConfigError, match="journals of controls; got 0 of 0 with gains"):
+        bench["hidden_flips"].flips([])
 
 
 def test_fake_laws_are_six_null_at_null_and_only_in_their_own_process(bench: dict[str, ModuleType]) -> None:
