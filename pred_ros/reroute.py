@@ -53,8 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def go(args: argparse.Namespace) -> int:
     """Prepare, run, judge, report. Raises: PredError."""
-    nodes = prepare(args)
     check_times(args)
+    nodes = prepare(args)
     goal = read_cloud(args.goal) if args.goal else through_slot(SlotConfig(), size_of(Twin.load(args.twin).body))
     fault = FAULTS[args.fault] if args.fault else None
     job = Job(nodes, goal, args.out, args.limit, fault, args.fault_at, None if args.no_pictures else "cam0")
