@@ -38,17 +38,18 @@ def test_runs_go_on_and_say_what_failed(
 
     monkeypatch.setattr(effects, "_pred", pred)
     monkeypatch.setattr(effects, "simulate", lambda root, hidden, seed: None)
-    done = tmp_path / "out" / "case50701"
+    first, second = (c.name for c in drawn.cases[:2])
+    done = tmp_path / "out" / first
     done.mkdir(parents=True)
     (done / "diagnosis.json").write_text("{}")
-    words = ["x", "run", "--work", str(tmp_path), "--jobs", "1", "--only", "case50701", "case50702"]
+    words = ["x", "run", "--work", str(tmp_path), "--jobs", "1", "--only", first, second]
     monkeypatch.setattr(sys, "argv", words)
     assert effects.main() == 1
     assert effects.main() == 1
     said = capsys.readouterr().out
-    assert "case50702 failed with code 2" in said and "1 of 2 cases are there" in said
+    assert f"{second} failed with code 2" in said and "1 of 2 cases are there" in said
     twins = [f"identify {c.reference}" for c in drawn.cases[:2]]
-    assert calls.read_text().splitlines() == [*twins, *["diagnose case50702"] * 2]
+    assert calls.read_text().splitlines() == [*twins, *[f"diagnose {second}"] * 2]
 
 
 def test_scores_are_written_and_foreign_truths_refused(
