@@ -25,13 +25,14 @@ from std_srvs.srv import Trigger
 
 from pred_core.bag import images
 from pred_core.bag.clouds import PointFrame
+from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, STATE_POINTS, TRACKER_POINTS
 from pred_core.config import setting
 from pred_core.errors import ConfigError, PredError
 from pred_core.track.estimate import Estimate, Prior
 from pred_core.track.line_config import LineConfig
 from pred_core.track.surface_tracker import SurfaceConfig
-from pred_core.track.tracker import MOST_CAMERAS, Tracker, TrackerConfig
+from pred_core.track.tracker import HEARD, MOST_CAMERAS, Tracker, TrackerConfig
 from pred_core.track.workspace import Workspace
 from pred_core.types import Box
 from pred_ros import convert, qos, shell
@@ -40,6 +41,7 @@ from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.shell import REFUSAL_SHOWN, Shell
 
 SILENT = 1.0  # [s] without a picture before a camera counts as dead
+WAITING = "waiting"
 GAP, GAP_TIMES = 0.25, 2.5  # [s], usual times between pictures: a longer silence of all cameras is said afterwards
 
 
@@ -121,6 +123,9 @@ class TrackerNode(Shell):
         self._worker: Future[None] | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="tracking")
         self._inputs: list[Subscription] = []
+        self._grippers: list[Subscription] = []
+        self._gripped = False  # the tracker has a gripper's pose and knows whether it is closed
+        self._first: float | None = None  # [s] of the first pictures
         self._lock = threading.Lock()  # guards what callbacks hand to the worker
         self._news: list[Callable[[Tracker], None]] = []
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
@@ -144,7 +149,7 @@ class TrackerNode(Shell):
     def start(self) -> None:
         """Subscribe and start the worker."""
         self._pairs = CameraPairs(self._names, self.seconds)
-        self._stopping, self._published = False, -1
+        self._stopping, self._published, self._gripped, self._first = False, -1, False, None
         self._worker = self._pool.submit(self._work)
         for name in self._names:
             for kind, topic in (("color", images.COLOR), ("depth", images.DEPTH)):
@@ -158,6 +163,7 @@ class TrackerNode(Shell):
                 self._listen(message_type, f"{name}/{topic}", callback, profile)
         self._listen(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed, qos.points_live())
         self._listen(PoseArray, GRIPPER_POSE, self._on_pose, qos.poses_live())
+        self._grippers = self._inputs[-2:]
         if self.config.prior:
             self._listen(PointCloud2, STATE_POINTS, self._on_state, qos.points_live())
         self._watch = self.create_timer(0.05, lambda: self.check_worker(self._worker))
@@ -169,7 +175,7 @@ class TrackerNode(Shell):
         self._worker = None
         for subscription in self._inputs:
             self.destroy_subscription(subscription)
-        self._inputs = []
+        self._inputs = self._grippers = []
         self.destroy_timer(self._watch)
         self._stopping = True
         self._pairs.close()
@@ -196,6 +202,8 @@ class TrackerNode(Shell):
             self.report(ERROR, self.refusal)
         elif len(silent) == len(self._names):
             self.report(ERROR, f"no pictures of {', '.join(silent)}: nothing is tracked")
+        elif self._status == WAITING:
+            self.report(WARN, "waiting for the gripper, which says which end of a line is the first")
         elif self._status != "tracking":
             self.report(WARN, f"{self._status}: the object is not in view, or is not a {self.config.kind}")
         elif gap_age is not None and gap_age < REFUSAL_SHOWN:
@@ -229,7 +237,7 @@ class TrackerNode(Shell):
     def _add_pose(self, message: PoseArray) -> None:
         pose = convert.message_to_pose(message)
         closed = self._closed
-        self._tell(lambda tracker: tracker.add_grip(pose.stamp, pose.position, pose.rotation, closed))
+        self._tell(lambda tracker: self._add_grip(tracker, pose, closed))
 
     def _on_state(self, message: PointCloud2) -> None:
         self.take(STATE_POINTS, self._add_state, message)
@@ -261,15 +269,32 @@ class TrackerNode(Shell):
                     action(self._tracker)
             except PredError as error:
                 self.refuse(error)
+            waits = bool(pairs) and self._waits()
             for name, pair in pairs.items():
                 try:
-                    self._tracker.add_frame(name, self._pairs.picture(name, pair))
+                    picture = self._pairs.picture(name, pair)
+                    if not waits:
+                        self._tracker.add_frame(name, picture)
                 except PredError as error:
                     self.refuse(error)
+            if waits:
+                self._status = WAITING
+                continue
             estimate = self._tracker.step()
             self._status = "searching" if estimate is None else estimate.status
             if estimate is not None:
                 self._publish(estimate)
+
+    def _add_grip(self, tracker: Tracker, pose: PoseFrame, closed: NDArray[np.bool_]) -> None:
+        tracker.add_grip(pose.stamp, pose.position, pose.rotation, closed)
+        self._gripped = self._gripped or len(closed) > 0
+
+    def _waits(self) -> bool:
+        """A gripper that is there but was not heard yet is waited for: a line that begins without it keeps its ends."""
+        self._first = self.seconds() if self._first is None else self._first
+        if self._gripped or self.seconds() - self._first > HEARD:
+            return False
+        return any(s.get_publisher_count() for s in self._grippers)
 
     def _publish(self, estimate: Estimate) -> None:
         t = estimate.tracks

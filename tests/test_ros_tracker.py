@@ -29,7 +29,7 @@ from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
 from pred_core.errors import ConfigError
 from pred_core.types import CameraFrame
-from pred_ros import convert, qos
+from pred_ros import convert, qos, tracker_node
 from pred_ros.tracker_node import TrackerNode, parse_cameras, parse_fixtures
 
 ERROR, WARN, OK = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
@@ -75,6 +75,11 @@ class Rig:
         depth.encoding, depth.step, depth.data = "32FC1", 4 * width, array("B", frame.depth.tobytes())
         self.color[name].publish(color)
         self.depth[name].publish(depth)
+
+    def shown(self, frame: CameraFrame, name: str) -> bool:
+        """Publish a picture; whether the node says that it waits for the gripper."""
+        self.show(frame, name)
+        return self.bench.says(WARN, "waiting for the gripper")
 
     def all(self, stamp: int, **changes: Any) -> None:
         """Gripper and both cameras at one stamp."""
@@ -156,6 +161,18 @@ def test_particles_lie_on_the_rope_and_carry_the_capture_stamp(rig: Rig) -> None
     length = np.linalg.norm(np.diff(last.position, axis=0), axis=-1).sum()
     assert length == pytest.approx(LENGTH, abs=0.010)
     rig.show_until(lambda: rig.bench.says(OK, "tracking"), NAMES)
+
+
+def test_a_gripper_that_is_there_is_waited_for(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line that begins without it has its ends by chance and keeps them: the held one would not be the first."""
+    monkeypatch.setattr(tracker_node, "HEARD", 1e9)
+    for name, frame in rig.scene.frames(START - 2 * STEP).items():
+        rig.calibrate(frame, name)
+        rig.bench.until(functools.partial(rig.shown, frame, name), "a picture that waits")
+    assert not rig.frames
+    rig.until_found()
+    away = np.linalg.norm(rig.frames[0].position - rig.scene.gripper, axis=-1)
+    assert away[0] < away[-1]
 
 
 def test_one_dead_camera_is_named_and_the_other_goes_on(rig: Rig) -> None:

@@ -62,6 +62,18 @@ def arc(count: int, radius: float = 0.2) -> Array:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, 0.1)], axis=-1)
 
 
+def test_a_line_is_not_begun_while_its_gripper_is_late(tracker: Tracker, scene: HangingRope) -> None:
+    """Ends get their ids when a line is begun. A gripper heard 0.2 s ago is waited for, one of 1.1 s not."""
+    scene.move(np.zeros(3))
+    begin = 10_000_000_000
+    for stamp, begins in ((begin, False), (begin + 900_000_000, True)):
+        tracker.reset()
+        tracker.add_grip(**scene.grip(begin - 200_000_000))
+        for name, frame in scene.frames(stamp).items():
+            tracker.add_frame(name, frame)
+        assert (tracker.step() is not None) == begins and tracker.searching != begins
+
+
 def test_chain_system_equals_its_dense_twin() -> None:
     rng = np.random.default_rng(0)
     nodes = np.cumsum(rng.normal(0.0, 1.0, (7, 3)), axis=0)

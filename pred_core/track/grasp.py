@@ -46,6 +46,10 @@ class GripperPath:
         while self._stamps[-1] - self._stamps[0] > KEPT:
             del self._stamps[0], self._poses[0]
 
+    def expected(self, stamp: int, silent: float) -> bool:
+        """Whether poses of `stamp` [ns] are still to come: there are some, the newest less than `silent` [s] old."""
+        return bool(self._stamps) and (stamp - self._stamps[-1]) * 1e-9 < silent and self.at(stamp) is None
+
     def at(self, stamp: int, late: float = 0.1) -> tuple[Array, Array] | None:
         """Position (G, 3) and rotation matrices (G, 3, 3) at `stamp` [ns]: linear between poses, the newest one for
         `late` [s] after it, else None."""

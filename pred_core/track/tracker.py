@@ -21,6 +21,7 @@ from pred_core.track.workspace import Shape, Workspace, check_workspace
 from pred_core.types import Array, CameraFrame, Capsule
 
 MOST_CAMERAS = 8
+HEARD = 1.0  # [s] for which a gripper that is there, but silent, is waited for before a line is begun
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,8 @@ class Tracker:
         self._views = {c: v for c, v in self._views.items() if v.stamp >= oldest}
         views = [self._views[c] for c in self.cameras if c in self._views]
         if self._searching:
-            if self.blind_to_arm(poses) or not self._find(views, frames, stamp, poses):
+            late = self._path.expected(stamp, HEARD)  # it says which end of a line is the first: ids keep that
+            if late or self.blind_to_arm(poses) or not self._find(views, frames, stamp, poses):
                 return None
             views = [self._views[v.camera] for v in views]
         prior = self._prior if self._prior is not None and abs(stamp - self._prior.stamp) * 1e-9 < 0.5 else None
