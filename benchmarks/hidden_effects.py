@@ -60,6 +60,8 @@ def main() -> int:
     """Run one of the commands."""
     args = _arguments()
     try:
+        if getattr(args, "jobs", 1) < 1:
+            raise ConfigError("--jobs", got=args.jobs, allowed="1 or more")
         return int(args.act(args))
     except PredError as error:
         print(f"hidden_effects: {error}", file=sys.stderr)
@@ -187,7 +189,7 @@ def _all(what: str, names: Sequence[str], jobs: int, do: Callable[[str], int]) -
     """Do it for every name, `jobs` at once, with an estimate of the time left. Returns the names that failed."""
     begin = time.monotonic()
     failed = []
-    with ProcessPoolExecutor(max(1, jobs)) as pool:
+    with ProcessPoolExecutor(jobs) as pool:
         running = {pool.submit(do, name): name for name in names}
         for done, future in enumerate(as_completed(running), start=1):
             name = running[future]

@@ -64,5 +64,13 @@ def code_of(work: Path, out: str, case: Case) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """What a file holds; None: it is not there."""
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+    """The mapping that a file holds; None: it is not there. Raises: ConfigError if it holds something else."""
+    if not path.exists():
+        return None
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{path} is not whole", got=str(error), next_step="Remove it and run again") from error
+    if not isinstance(found, dict):
+        raise ConfigError(f"{path} holds no mapping", got=type(found).__name__, next_step="Remove it and run again")
+    return found

@@ -7,13 +7,17 @@ from collections.abc import Mapping
 from typing import Any
 
 from pred_core.config import from_mapping
+from pred_core.errors import ConfigError
 from pred_ros.parameters import is_library_name
 from pred_ros.shell import Shell
 
 
 def check_parameters(nodes: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raise ConfigError if a node would refuse its parameters: an unknown name, a wrong type, a value out of range."""
+    """Raise ConfigError for an unknown name, a wrong type or a value out of range. What a text means, a node checks."""
     for node, given in nodes.items():
+        odd = [name for name in given if not isinstance(name, str)]
+        if odd:
+            raise ConfigError(f"name of a parameter of {node}", got=odd[0], allowed="text")
         own = {name: value for name, value in given.items() if not is_library_name(name)}
         from_mapping(config_class(node), own, f"parameters of {node}")
 

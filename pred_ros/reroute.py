@@ -111,8 +111,8 @@ def prepare(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     missing = [n for n in NODES if n not in nodes]
     if missing:
         raise ConfigError(f"{args.nodes}: {', '.join(missing)} missing", got=", ".join(nodes), allowed=", ".join(NODES))
-    ignored = nodes["tracker"].get("fixtures")
-    if isinstance(ignored, str) and parse_fixtures(ignored) == parse_fixtures(fixtures_of(slot_of(nodes["plant"]))):
+    posts = nodes["tracker"].get("fixtures")
+    if isinstance(posts, str) and parse_fixtures(posts) == parse_fixtures(fixtures_of(slot_of(nodes["plant"]))):
         del nodes["tracker"]["fixtures"]
     port = free_port()
     for node in ("plant", "arm"):
@@ -123,11 +123,11 @@ def prepare(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     nodes["planner"].setdefault("settings", str(config_folder() / "plan" / "slot.yaml"))
     nodes["planner"]["seed"] = args.seed
     apply_overrides(nodes, args.overrides)
+    check_parameters(nodes)
     slot = slot_of(nodes["plant"])
     if load_settings(nodes["planner"]["settings"]).slot is not None:
         nodes["planner"].setdefault("gap", slot.gap)
-    nodes["tracker"].setdefault("fixtures", fixtures_of(slot))
-    check_parameters(nodes)
+    parse_fixtures(nodes["tracker"].setdefault("fixtures", fixtures_of(slot)))
     return nodes
 
 

@@ -68,6 +68,10 @@ def test_scores_are_written_and_foreign_truths_refused(
     truth.write_text(json.dumps({"hidden": [], "seed": case.seed + 1}))
     assert bench["hidden_effects"].main() == 2
     assert "is of another case" in capsys.readouterr().err
+    for text, told in (("{", "is not whole"), ("[]", "holds no mapping")):
+        truth.write_text(text)
+        assert bench["hidden_effects"].main() == 2
+        assert told in capsys.readouterr().err
 
 
 def left_by_a_run(work: Path, cases: Sequence[Any]) -> None:

@@ -210,6 +210,10 @@ def test_through_weighs_the_way_and_the_end_and_asks_only_what_the_goal_does() -
     assert ThroughCost(SLOT, body, not_yet, 1.0)(late).item() == 0.0
     barely = row(101, 0.01, (-0.985, 0.0, 0.05))  # 2 of 101 points, 1.98 cm of 1 m: less than leads through
     assert ThroughCost(SLOT, body, barely, 1.0)(late).item() == 0.0
+    beside, over = across_slot(-0.65, y=0.2), across_slot(-0.65, z=0.14)
+    in_the_plane = across_slot(-0.65)[:, [1, 0, 2]] + [1e-6, 0.0, 0.0]
+    for elsewhere in (beside, over, in_the_plane, in_the_plane * [-1.0, 1.0, 1.0]):
+        assert ThroughCost(SLOT, body, elsewhere, 1.0)(late).item() == 0.0, "a goal that is not through the gap"
     with pytest.raises(ConfigError, match="a line"):
         ThroughCost(SLOT, dataclasses.replace(body, kind="sheet"), goal, 1.0)
 

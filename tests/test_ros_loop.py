@@ -119,6 +119,7 @@ def test_a_node_that_fails_ends_the_run_with_its_own_line(tmp_path: Path) -> Non
         (["--goal", "goal.png"], "unknown kind of cloud"),
         (["--limit", "nan"], "--limit"),
         (["--seed", "-1"], "--seed"),
+        (["tracker.fixtures=abc"], "abc"),
         (["--fault", "slip", "--limit", "2"], "Give a longer --limit"),
         (["--nodes", "config/nodes/live.yaml"], "plant, tracker, planner, arm missing"),
     ],
@@ -243,6 +244,7 @@ def test_a_file_may_name_other_fixtures_than_the_posts(tmp_path: Path) -> None:
     ("plant.fctor=0.5", "parameters of plant: unknown key 'fctor'. did you mean 'factor'?"),
     ("plant.factor=fast", "parameters of plant: factor; got 'fast' (str); allowed: float."),
     ("planner.budget=-1.0", "parameters of planner: budget; got -1.0 s; allowed: "),
+    ("planner.settings=3", "parameters of planner: settings; got 3 (int); allowed: str"),
     ("tracker.cameras=[cam0", "override 'tracker.cameras=[cam0'; got a value that is not YAML"),
 ])  # fmt: skip
 def test_what_a_node_would_refuse_is_told_before_any_has_started(

@@ -17,7 +17,7 @@ from pred_core.plan.rollouts import Rollouts
 from pred_core.plan.slot import Slot
 from pred_core.types import Array, Body
 
-BEYOND = 0.02  # [m] of line on either side; a goal with less does not lead through
+BEYOND = 0.02  # [m] to either side, of place and of line; a goal with less does not lead through
 
 
 class ThroughCost:
@@ -28,8 +28,8 @@ class ThroughCost:
 
         p = max(0, 1 - |f - f*| / min(f*, 1 - f*)) max(0, 1 - d / h)
 
-    if the line's ends lie on different sides, else 0; 1 is a line that is through as far as the goal is. A goal
-    that lies on one side only asks for nothing.
+    if the line's ends lie on different sides, else 0; 1 is a line that is through as far as the goal is. A goal that
+    lies on one side only, in the plane, or crosses it beside the gap asks for nothing.
     """
 
     name = "through"
@@ -39,9 +39,10 @@ class ThroughCost:
         self._line = SlotLine(slot, body)
         pieces = np.diff(np.sort(body.arc))
         self._pieces = torch.as_tensor(pieces / pieces.sum(), dtype=torch.float32)
-        self._wanted = float((((goal - slot.foot) @ slot.axes[0]) >= 0.0).mean())
+        local = (goal - slot.foot) @ slot.axes.T  # (Q, 3) through, across, up
+        self._wanted = float((local[:, 0] >= 0.0).mean())
         self._least = min(self._wanted, 1.0 - self._wanted)
-        self._asked = self._least * size_of(body) >= BEYOND
+        self._asked = self._least * size_of(body) >= BEYOND and _through(local, slot)
         self._height, self._weight = slot.height, weight
 
     def __call__(self, rollouts: Rollouts) -> Tensor:
@@ -62,3 +63,13 @@ class ThroughCost:
         apart = beyond[..., 0] != beyond[..., -1]
         amount = (1.0 - (f - self._wanted).abs() / self._least).clamp_min(0.0)
         return amount * (1.0 - found.off / self._height).clamp_min(0.0) * apart.to(amount)
+
+
+def _through(goal: Array, slot: Slot) -> bool:
+    """Whether a goal (Q, 3) [m], in the slot's axes, lies on both sides and, at the plane, in the opening."""
+    through = goal[:, 0]
+    if through.max() < BEYOND or through.min() > -BEYOND:
+        return False
+    near = goal[np.abs(through) <= max(BEYOND, np.abs(through).min())]
+    across, height = np.median(np.abs(near[:, 1])), np.median(near[:, 2])
+    return bool(across <= 0.5 * slot.gap and height <= slot.height)
