@@ -262,7 +262,6 @@ def _one_beside(args: argparse.Namespace, cases: Mapping[str, Case], name: str) 
 
 def score_cases(args: argparse.Namespace) -> int:
     """The table of what has been diagnosed."""
-    rows: list[Judgement] = []
     simple: dict[str, list[Judgement]] = {}
     cases = chosen(release(args.set), args.only)
     done = diagnosed(args.work, args.out, cases)
@@ -270,18 +269,21 @@ def score_cases(args: argparse.Namespace) -> int:
     codes = {code_of(args.work, args.out, c) for c in done}
     for case in done:
         check_truth(args.work, case)
-        rows += [row] if (row := _judged(args.work, args.out, case)) else []
+    rows = [_judged(args.work, args.out, case) for case in done]
+    for case in done:
         paired = read_json(args.work / "paired" / f"{case.name}.json")
         for method, answer in (read_json(args.work / "baselines" / f"{case.name}.json") or {}).items():
-            row = judged(case.name, case.reference, case.hidden, answer, {}, None, paired)
-            simple.setdefault(method, []).append(row)
+            simple.setdefault(method, []).append(
+                judged(case.name, case.reference, case.hidden, answer, {}, None, paired)
+            )
     result = scores(rows, placebos=args.placebos)
     if simple:
         result["baselines"] = compare({"diagnosis": rows, **simple})
-    less = {step: [_judged(args.work, without(step), case) for case in cases] for step in STEPS}
-    if any(row for found in less.values() for row in found):
-        codes |= {code_of(args.work, without(s), c) for s in STEPS for c, r in zip(cases, less[s], strict=True) if r}
-        result["ablations"] = ablated(rows, {s: [r for r in found if r] for s, found in less.items() if any(found)})
+    answered = {step: [c for c in cases if (args.work / without(step) / c.name / ANSWER).exists()] for step in STEPS}
+    less = {step: [_judged(args.work, without(step), c) for c in found] for step, found in answered.items() if found}
+    if less:
+        codes |= {code_of(args.work, without(step), c) for step, found in answered.items() for c in found}
+        result["ablations"] = ablated(rows, less)
     print(markdown(result))
     print(f"\n{len(rows)} cases scored, {len(missing)} without an answer{': ' + ', '.join(missing) if missing else ''};"
           f" answers of {len(codes)} version{'s' * (len(codes) > 1)} of the code")  # fmt: skip
@@ -289,12 +291,10 @@ def score_cases(args: argparse.Namespace) -> int:
     return 0
 
 
-def _judged(work: Path, out: str, case: Case) -> Judgement | None:
-    """What an answer is worth; None: it is not there."""
+def _judged(work: Path, out: str, case: Case) -> Judgement:
+    """What an answer that is there is worth."""
     answer = work / out / case.name
     said = read_json(answer / ANSWER)
-    if said is None:
-        return None
     beside = {what: read_json(work / what / f"{case.name}.json") for what in ("oracle", "paired")}
     return judged(case.name, case.reference, case.hidden, said, base=_base(answer), **beside)
 

@@ -105,7 +105,7 @@ def prepare(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """Parameters of every node: the file's, a free port, the twin, the planner's settings, then the overrides.
 
     Planner and tracker are told the plant's gap; fixtures that are not the posts of the file's own gap stay as given.
-    Raises: ConfigError, also for what a node would refuse.
+    Raises: ConfigError, also for a parameter that no node has, of a wrong type or out of its range.
     """
     nodes = read_nodes(args.nodes)
     missing = [n for n in NODES if n not in nodes]

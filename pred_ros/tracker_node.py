@@ -161,9 +161,8 @@ class TrackerNode(Shell):
             ):
                 callback = functools.partial(self.take, f"{name}/{topic}", functools.partial(add, name))
                 self._listen(message_type, f"{name}/{topic}", callback, profile)
-        self._listen(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed, qos.points_live())
-        self._listen(PoseArray, GRIPPER_POSE, self._on_pose, qos.poses_live())
-        self._grippers = self._inputs[-2:]
+        closed = self._listen(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed, qos.points_live())
+        self._grippers = [closed, self._listen(PoseArray, GRIPPER_POSE, self._on_pose, qos.poses_live())]
         if self.config.prior:
             self._listen(PointCloud2, STATE_POINTS, self._on_state, qos.points_live())
         self._watch = self.create_timer(0.05, lambda: self.check_worker(self._worker))
@@ -175,7 +174,7 @@ class TrackerNode(Shell):
         self._worker = None
         for subscription in self._inputs:
             self.destroy_subscription(subscription)
-        self._inputs = self._grippers = []
+        self._inputs, self._grippers = [], []
         self.destroy_timer(self._watch)
         self._stopping = True
         self._pairs.close()
@@ -218,8 +217,9 @@ class TrackerNode(Shell):
         else:
             self.report(OK, "tracking")
 
-    def _listen(self, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any) -> None:
+    def _listen(self, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any) -> Subscription:
         self._inputs.append(self.create_subscription(kind, topic, callback, profile))
+        return self._inputs[-1]
 
     def _on_image(self, name: str, kind: str, message: Image) -> None:
         self.diagnostics.seen(f"{name} {kind}")

@@ -66,8 +66,8 @@ def against(rows: np.ndarray) -> float:
 def test_friction_opposes_the_sliding_and_not_without_the_jacobians_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = slide()
     taken, rate = rows[:, 5:8], rows[:, 8:]
-    assert np.abs(rate[:, 1:]).max() > 5.0  # [m/s^2] as much as 1.6 cm/s of sliding counts for
+    assert np.abs(rate[:, 1:]).max() > 5.0  # [m/s^2] as much as 1.6 cm/s of sliding counts for; 19 measured
     assert np.allclose(taken, rate, atol=1e-9)
-    assert against(rows) > 0.85
+    assert against(rows) > 0.97  # 0.995 measured
     monkeypatch.setattr(plant_world, "add_contact_bias", lambda model, data: None)
-    assert against(slide()) < 0.6
+    assert against(slide()) < 0.6  # 0.515 measured

@@ -1,9 +1,9 @@
 """The part of a contact's acceleration that MuJoCo leaves out, and with it the direction of friction.
 
 The acceleration of a contact is J dv/dt + dJ/dt v. MuJoCo asks the first term alone to follow its reference, so the
-second one, which the joints' turning brings, passes for sliding. A rope that is led over the table has up to 16 m/s^2
-of it, as much as a contact that slides by 5 cm/s: the friction of a sliding link stood 73 degrees off the way it slid
-(mean cosine 0.3; 0.95 with the term), and high coefficients acted like low ones.
+second one, which the joints' turning brings, passes for sliding. A rope that is led over the table has up to 19 m/s^2
+of it, as much as a contact that slides by 6 cm/s. The mean cosine between the friction of a sliding link and the way
+back was 0.51; with the term it is 0.99 (an episode of 2 s, tests/test_plant_contact_bias.py).
 """
 
 from __future__ import annotations
