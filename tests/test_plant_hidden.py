@@ -123,20 +123,34 @@ def test_drags_slow_a_free_rope_down_by_their_law() -> None:
         assert speed == pytest.approx(expected, rel=0.01), name
 
 
-def test_viscous_friction_stops_a_link_at_most() -> None:
-    """1 m/s along the table. A load of 1e-4 N and c = 2 s/m: 2e-4 N back. A blow of 50 N: m / step, which stops the
-    link within a step of 1/300 s, and not 100 N, which would send a link of 1.6 g back at 200 m/s.
-    """
+def test_viscous_friction_is_a_coefficient_that_grows_with_speed() -> None:
+    """mu + c v = 0.6 + 2 s/m x 0.5 m/s, also in the contacts; without speed the rope's own 0.6."""
     free = free_rope()
-    free.data.qvel[:] = 0.0
-    free.data.qvel[0] = 1.0
-    mujoco.mj_forward(free.model, free.data)
+    free.data.qpos[:3] = 0.0, 0.0, RopeConfig().radius
+    free.data.qpos[3:7] = np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0  # lies along x
     effect = make_effect("friction_viscous", 2.0, 0)
-    for load, expected in ((1e-4, np.full(32, -2e-4)), (50.0, -free.mass / free.model.opt.timestep)):
-        free.load[:] = load
-        free.data.xfrc_applied[:] = 0.0
+    effect.begin(free)
+    for speed, expected in ((0.0, 0.6), (0.5, 1.6)):
+        free.data.qvel[:] = 0.0
+        free.data.qvel[1] = speed
+        mujoco.mj_forward(free.model, free.data)
         effect.act(free)
-        assert free.data.xfrc_applied[free.links, 0] == pytest.approx(expected, rel=1e-6)
+        mujoco.mj_forward(free.model, free.data)
+        used = [c.friction[0] for c in free.data.contact]
+        assert used and used == pytest.approx([expected] * len(used), rel=1e-6)
+
+
+def test_a_finer_step_makes_no_other_viscous_friction() -> None:
+    """Blows on the table, 1/300 s long, are where the load is: mean displacement by the effect, steps of 1 and 1/8."""
+    motion = plan("table", seed=3).motion
+    sizes = []
+    for parts in (1, 8):
+        records = [
+            run_episode(World(build_rope(RopeConfig()), effects), motion, 2.0, 30, parts)
+            for effects in ((), (make_effect("friction_viscous", 18.0, 0),))
+        ]
+        sizes.append(np.linalg.norm(records[1].position - records[0].position, axis=-1).mean())
+    assert sizes[0] == pytest.approx(sizes[1], rel=0.2)
 
 
 def test_the_swirl_turns_motion_and_does_no_work() -> None:

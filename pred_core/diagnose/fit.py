@@ -23,6 +23,8 @@ STEP = 0.05  # of a difference, in coordinates (typical changes)
 LONGEST = 2.0  # coordinates a step; twice as many after each step that was cut and helped
 PATIENCE = 5  # times the damping is raised before giving up
 CONVERGED = 2e-4  # relative change of the loss
+STIFFENS = 1.002  # times the substeps needed: a coordinate that raises them by more presses on their limit
+PARTS = (0.5, 0.25, 0.125, 0.0)  # of its step that such a coordinate may still go
 PRIOR = 1e-4  # pull of a coordinate towards its start, a typical change squared, as a loss: breaks ties
 
 
@@ -116,8 +118,8 @@ def fit(
 ) -> Fit:
     """The local optimum near z, on all episodes or on `chosen` (E,) bool.
 
-    Steps to where more than `most` times the substeps of the start are needed are not taken: what the data do not
-    show (axial damping) must not make the simulation slow.
+    Steps to where more than `most` times the substeps of the start are needed are cut: what the data do not show
+    (axial damping) must not make the simulation slow, and what they do show must not wait for it.
     """
     lower, upper = (np.array(b) for b in space.bounds())
     z = np.clip(np.asarray(z, dtype=np.float64), lower, upper)
@@ -132,17 +134,17 @@ def fit(
         before = float(loss[use].mean()) + 0.5 * PRIOR * float(((z - origin) ** 2).sum())
         found = None
         for _ in range(PATIENCE):
-            move = -np.linalg.solve(h + damping * np.diag(np.diag(h)) + 1e-12 * np.eye(len(z)), g)
-            trial = np.clip(z + np.clip(move, -longest, longest), lower, upper)
-            if target.roller.demand(space.candidate(trial)) > limit:
+            trial = _within(target, space, z, (g, h + damping * np.diag(np.diag(h))), longest, limit)
+            if trial is None:
                 damping *= 8.0
                 continue
+            move = trial - z
             finer = max(substeps, target.roller.substeps([space.candidate(trial)]))
             tried = target.per_episode(rho(target.residuals(space, [trial], finer)))[0]
             after = float(tried[use].mean()) + 0.5 * PRIOR * float(((trial - origin) ** 2).sum())
             if after < before:
                 found = trial
-                longest *= 2.0 if np.abs(move).max() > longest else 1.0
+                longest *= 2.0 if np.abs(move).max() >= longest else 1.0
                 break
             damping, longest = damping * 8.0, LONGEST
         if found is None:
@@ -152,6 +154,40 @@ def fit(
         if before - after < CONVERGED * before:
             break
     return Fit(z, loss, gradient, curvature)
+
+
+def _within(
+    target: Target, space: SearchSpace, z: Array, model: tuple[Array, Array], longest: float, limit: float
+) -> Array | None:
+    """The Newton step of `model` (gradient (P,), curvature (P, P)) from z, cut to `longest` a coordinate. Coordinates
+    that would need more substeps than `limit` go part of the way or none, and the others follow them; None: no way.
+    """
+    g, h = model
+    h = h + 1e-12 * np.eye(len(z))
+    lower, upper = (np.array(b) for b in space.bounds())
+
+    def after(move: Array) -> Array:
+        return np.clip(z + np.clip(move, -longest, longest), lower, upper)
+
+    def needed(point: Array) -> float:
+        return target.roller.demand(space.candidate(point))
+
+    move = np.asarray(-np.linalg.solve(h, g), dtype=np.float64)
+    whole = after(move)
+    if needed(whole) <= limit:
+        return whole
+    here = needed(z)
+    alone = np.where(np.eye(len(z), dtype=bool), whole, z)
+    pressing = np.array([needed(point) > STIFFENS * here for point in alone])
+    free = ~pressing
+    for part in PARTS if pressing.any() else ():
+        move = np.where(pressing, part * (whole - z), 0.0)
+        if free.any():
+            move[free] = -np.linalg.solve(h[np.ix_(free, free)], g[free] + h[np.ix_(free, pressing)] @ move[pressing])
+        cut = after(move)
+        if needed(cut) <= limit and (cut != z).any():
+            return cut
+    return None
 
 
 def without_groups(result: Fit, space: SearchSpace, groups: NDArray[np.int64]) -> dict[int, Array]:

@@ -78,10 +78,8 @@ class World:
         self.joint_dof: Index = self.model.jnt_dofadr[self.joints].astype(np.int64)
         self.mass: Array = self.model.body_mass[self.links].copy()
         self.material: Array = rope.material
-        self.load: Array = np.zeros(len(self.links))  # (L,) [N] normal force of the last step, if an effect needs it
         self.time = 0.0  # [s] of the recording; negative while it settles
         self.session = session  # [s] of the whole session at time 0
-        self._loads = any(e.needs_load for e in self.effects)
 
     @property
     def position(self) -> Array:
@@ -120,8 +118,6 @@ class World:
         if drive is not None:
             drive.push(data, index)
         mujoco.mj_step2(self.model, data)
-        if self._loads:
-            self._read_load()
 
     def material_points(self, arc: Array) -> Array:
         """Positions (P, 3) [m] of material points at `arc` (P,) [m] from the gripper's end."""
@@ -129,19 +125,6 @@ class World:
         link = np.minimum((arc / length).astype(int), len(self.links) - 1)
         down = -self.data.xmat[self.links[link]].reshape(-1, 3, 3)[:, :, 2]
         return self.data.xpos[self.links[link]] + (arc - link * length)[:, None] * down
-
-    def _read_load(self) -> None:
-        self.load[:] = 0.0
-        force = np.zeros(6)
-        first = int(self.geoms[0])
-        for n in range(self.data.ncon):
-            contact = self.data.contact[n]
-            pair = (int(contact.geom1), int(contact.geom2))
-            if self.ground in pair:
-                mujoco.mj_contactForce(self.model, self.data, n, force)
-                link = (pair[0] if pair[1] == self.ground else pair[1]) - first
-                if 0 <= link < len(self.load):
-                    self.load[link] += force[0]
 
 
 def run_episode(world: World, motion: Motion, seconds: float, particles: int, parts: int = 1) -> Record:

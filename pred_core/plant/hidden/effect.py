@@ -24,8 +24,6 @@ class HiddenEffect:
     motions and noise from other generators, so they are the same for every effect of a seed.
     """
 
-    needs_load = False  # reads world.load
-
     def __init__(self, magnitude: float, generator: np.random.Generator):
         self.magnitude = magnitude
         self.generator = generator
