@@ -296,7 +296,13 @@ def _judged(work: Path, out: str, case: Case) -> Judgement:
     answer = work / out / case.name
     said = read_json(answer / ANSWER)
     beside = {what: read_json(work / what / f"{case.name}.json") for what in ("oracle", "paired")}
-    return judged(case.name, case.reference, case.hidden, said, base=_base(answer), **beside)
+    try:
+        return judged(case.name, case.reference, case.hidden, said, base=_base(answer), **beside)
+    except (KeyError, TypeError, IndexError, AttributeError) as error:
+        raise ConfigError(
+            f"{case.name}: its answer, oracle or paired error is not whole", got=f"{type(error).__name__}: {error}",
+            allowed="files as `run`, `oracle` and `paired` write them", next_step="Remove them and make them again",
+        ) from error  # fmt: skip
 
 
 def _base(answer: Path) -> dict[str, float]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from pred_core.config import from_mapping
 from pred_core.errors import ConfigError
-from pred_ros.parameters import is_library_name
+from pred_ros.parameters import SWITCHES, is_library_name
 from pred_ros.shell import Shell
 
 
@@ -18,6 +18,9 @@ def check_parameters(nodes: Mapping[str, Mapping[str, Any]]) -> None:
         odd = [name for name in given if not isinstance(name, str)]
         if odd:
             raise ConfigError(f"name of a parameter of {node}", got=odd[0], allowed="text")
+        for name in SWITCHES:
+            if not isinstance(given.get(name, False), bool):
+                raise ConfigError(f"parameters of {node}: {name}", got=repr(given[name]), allowed="true, false")
         own = {name: value for name, value in given.items() if not is_library_name(name)}
         from_mapping(config_class(node), own, f"parameters of {node}")
 

@@ -17,13 +17,13 @@ from pred_core.errors import ConfigError, PredError, nearest
 T = TypeVar("T")
 
 # What the client library itself declares or accepts beside the node's own parameters.
-_LIBRARY_NAMES = ("use_sim_time", "start_type_description_service")
+SWITCHES = ("use_sim_time", "start_type_description_service")
 _LIBRARY_PREFIXES = ("qos_overrides.",)
 
 
 def is_library_name(name: str) -> bool:
     """True for parameters that belong to the client library rather than to the node."""
-    return name in _LIBRARY_NAMES or name.startswith(_LIBRARY_PREFIXES)
+    return name in SWITCHES or name.startswith(_LIBRARY_PREFIXES)
 
 
 def declare(node: Node, cls: type[T], overrides: dict[str, Any]) -> T:

@@ -40,6 +40,29 @@ def test_a_journal_belongs_to_its_data(tmp_path: Path) -> None:
     assert '"a"' not in path.read_text()
 
 
+def test_nothing_is_written_before_a_piece_is_finished(tmp_path: Path) -> None:
+    """Data that do not fit the twin are told of after the journal was opened: another diagnosis' journal stays."""
+    path = tmp_path / "journal.jsonl"
+    Journal(path, {"data": "a"})
+    assert not path.exists()
+    Journal(path, {"data": "a"}).once("x", lambda: 1)
+    before = path.read_text()
+    Journal(path, {"data": "b"})
+    assert path.read_text() == before and not (tmp_path / "journal.old.jsonl").exists()
+
+
+def test_a_line_that_was_cut_off_is_written_anew(tmp_path: Path) -> None:
+    path = tmp_path / "journal.jsonl"
+    first = Journal(path, {})
+    first.once("x", lambda: 1)
+    whole = path.read_text()
+    first.once("y", lambda: 2)
+    path.write_text(path.read_text()[:-5])
+    again = Journal(path, {})
+    assert again.once("x", lambda: 3) == 1 and again.once("y", lambda: 4) == 4
+    assert path.read_text() == whole + '{"key": "y", "value": 4}\n'
+
+
 @pytest.mark.parametrize("line", ["not a line", '{"key": "x"}', "[1, 2]", "3"])
 def test_a_damaged_journal_is_refused(tmp_path: Path, line: str) -> None:
     path = tmp_path / "journal.jsonl"

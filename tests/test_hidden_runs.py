@@ -65,6 +65,11 @@ def test_scores_are_written_and_foreign_truths_refused(
     assert bench["hidden_effects"].main() == 0
     assert "0/1 = 0 % [0.0 to 97.5]" in capsys.readouterr().out
     assert json.loads((tmp_path / "out" / "scores.json").read_text())["confusion"] == {"none": {"none": 1}}
+    whole = (out / "diagnosis.json").read_text()
+    (out / "diagnosis.json").write_text("{}")
+    assert bench["hidden_effects"].main() == 2
+    assert f"{case.name}: its answer, oracle or paired error is not whole" in capsys.readouterr().err
+    (out / "diagnosis.json").write_text(whole)
     truth.write_text(json.dumps({"hidden": [], "seed": case.seed + 1}))
     assert bench["hidden_effects"].main() == 2
     assert "is of another case" in capsys.readouterr().err

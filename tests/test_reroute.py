@@ -232,6 +232,15 @@ def test_scripted_hands_of_the_four_tasks(bench) -> None:
     assert (abs(bent[0] - 0.45), bent[1]) == pytest.approx((0.08, -0.24))
 
 
+def test_looked_at_once_a_plan_is_carried_out_whole(bench) -> None:
+    """The same task but for the search, which has one plan's time; the arm rests before the trial is measured."""
+    tasks = bench["rope_tasks"]
+    usual, once = load_settings(str(tasks.SETTINGS)), load_settings(str(tasks.SETTINGS_ONCE))
+    assert dataclasses.replace(once, send=usual.send, search=usual.search) == usual
+    assert once.send == once.motion.horizon
+    assert once.motion.horizon + bench["reroute_trial"].TrialConfig().latency < tasks.REST
+
+
 def hanging(twin: Twin) -> np.ndarray:
     """(N, 3) [m] the twin's rope straight down from 1.1 m: each spring is strained by the weight below it over its
     stiffness, 0.45 N / 30 N = 1.5 % at the hand."""

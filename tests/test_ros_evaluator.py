@@ -231,6 +231,8 @@ def test_shipped_parameter_files_fit_the_nodes(file: Path) -> None:
     check_parameters(nodes)
     with pytest.raises(ValueError, match="unknown key 'fctor'"):
         check_parameters({**nodes, next(iter(nodes)): {"fctor": 1.0}})
+    with pytest.raises(ValueError, match="use_sim_time; got 'yes'; allowed: true, false"):
+        check_parameters({**nodes, next(iter(nodes)): {"use_sim_time": "yes"}})
 
 
 def test_every_node_has_parameters_of_its_own() -> None:
