@@ -10,6 +10,7 @@ from report_cases import judged, rope
 
 from pred_core.diagnose import evidence
 from pred_core.diagnose.evidence import Judged, elsewhere, family_wise, lack_of_fit, rivals, set_limit, simplest
+from pred_core.diagnose.naming import share_closed
 from pred_core.diagnose.progress import Named, refitted
 from pred_core.diagnose.ranking import nothing
 from pred_core.diagnose.trial import make_trial
@@ -190,3 +191,10 @@ def test_causes_that_save_in_other_episodes_are_not_two_names_for_one(twin: Twin
     drag, table, wind = gains(twin, np.array([[4.0, 4.0, 0.2, 0.0], [0.0, 0.0, 3.0, 3.0], [3.9, 3.9, 0.2, -1.0]]))
     assert rivals([table], drag)[0][1] < set_limit(4)
     assert elsewhere(table, drag) and elsewhere(drag, table) and not elsewhere(wind, drag)
+
+
+def test_a_cause_explains_all_where_motions_are_easier_than_the_references(twin: Twin) -> None:
+    """10 are left without the cause, 6 with it. Beside a reference at 4 that is 4 of 6; beside one at 12, all."""
+    found = judged(twin, "drag_linear", 1.0, 0.1, [4.0] * 8)
+    assert share_closed(found, excess=6.0, floor=4.0) == pytest.approx(4.0 / 6.0)
+    assert share_closed(found, excess=-2.0, floor=12.0) == 1.0

@@ -58,7 +58,7 @@ def choose(
         and not (o.parameters > chosen.parameters and not much_better(o, chosen))
     ]
     q = next(row[1] for row in accepted if row[0] is chosen)
-    closed = share_closed(chosen, progress, excess, floor)
+    closed = share_closed(chosen, excess, floor)
     return Named(chosen, q, tuple(o.trial.id for o in near), closed, len(progress.rounds)), rows
 
 
@@ -96,9 +96,11 @@ def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress
     return ""
 
 
-def share_closed(j: Judged, progress: Progress, excess: float, floor: float) -> float:
-    """Share of the round's excess that is gone with it, 0 to 1."""
+def share_closed(j: Judged, excess: float, floor: float) -> float:
+    """Share of the round's excess that is gone with it, 0 to 1; all of it where motions are so easy that there is none:
+    a named cause then leaves less than what is usual on the reference.
+    """
     if excess <= 0.0:
-        return 0.0
+        return 1.0
     standing = excess + floor
     return float(np.clip((standing - float(j.extended.mean())) / excess, 0.0, 1.0))

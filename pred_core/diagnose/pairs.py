@@ -59,4 +59,4 @@ def try_pairs(
     p = float(family_wise(tried, config.seed, groups)[[t is best for t in tried].index(True)])
     if why_not(best, p, excess, floor, progress) or not all(best.is_on(id) for id in best.trial.ids):
         return None
-    return Named(best, p, (), share_closed(best, progress, excess, floor), number)
+    return Named(best, p, (), share_closed(best, excess, floor), number)
