@@ -21,6 +21,7 @@ from pred_core.types import Array
 
 STEP = 0.05  # of a difference, in coordinates (typical changes)
 LONGEST = 2.0  # coordinates a step; twice as many after each step that was cut and helped
+CUT = 1.0 - 1e-9  # of the longest step, from which one counts as cut: rounding may take the rest
 PATIENCE = 5  # times the damping is raised before giving up
 CONVERGED = 2e-4  # relative change of the loss
 STIFFENS = 1.002  # times the substeps needed: a coordinate that raises them by more presses on their limit
@@ -138,13 +139,12 @@ def fit(
             if trial is None:
                 damping *= 8.0
                 continue
-            move = trial - z
             finer = max(substeps, target.roller.substeps([space.candidate(trial)]))
             tried = target.per_episode(rho(target.residuals(space, [trial], finer)))[0]
             after = float(tried[use].mean()) + 0.5 * PRIOR * float(((trial - origin) ** 2).sum())
             if after < before:
                 found = trial
-                longest *= 2.0 if np.abs(move).max() >= longest else 1.0
+                longest *= 2.0 if np.abs(trial - z).max() >= CUT * longest else 1.0
                 break
             damping, longest = damping * 8.0, LONGEST
         if found is None:
