@@ -120,11 +120,13 @@ def write_tasks(work: Path) -> None:
     rows, figures = [], {}
     for name, trials in groups.items():
         times, _ = curve(trials)
-        soon = [1e3 * float(np.interp(SOON, *np.array(t["chamfer"]).T)) for t in trials]
+        looks = [] if name.endswith(ONCE) else trials  # nothing is measured in between there
+        soon = [1e3 * float(np.interp(SOON, *np.array(t["chamfer"]).T)) for t in looks]
         end = [1e3 * t["chamfer"][-1][1] for t in trials]
         begin = [1e3 * t["chamfer"][0][1] for t in trials]
         figures[name] = {"trials": len(trials), "begin_mm": begin, "soon_mm": soon, "end_mm": end}
-        rows.append((name, str(len(trials)), *(f"{np.mean(v):.1f} +- {np.std(v):.1f}" for v in (begin, soon, end))))
+        means = (f"{np.mean(v):.1f} +- {np.std(v):.1f}" if v else "–" for v in (begin, soon, end))
+        rows.append((name, str(len(trials)), *means))
         print(" | ".join(rows[-1]), f"| to {times[-1]:.1f} s")
     if not groups:
         return
@@ -133,7 +135,8 @@ def write_tasks(work: Path) -> None:
     (work / "tasks.json").write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     page = Page("Four rope tasks")
     page.table(("twin, task", "trials", "begin [mm]", f"after {SOON:g} s [mm]", "end [mm]"), rows)
-    page.figure(curves(groups), "Chamfer distance to the goal: each trial, and the median.")
+    told = "Chamfer distance to the goal: each trial, and the median. Of tasks looked at once, only the ends are measured."
+    page.figure(curves(groups), told)
     page.write(work / "tasks.html")
 
 
