@@ -135,7 +135,7 @@ def write_tasks(work: Path) -> None:
     (work / "tasks.json").write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     page = Page("Four rope tasks")
     page.table(("twin, task", "trials", "begin [mm]", f"after {SOON:g} s [mm]", "end [mm]"), rows)
-    told = "Chamfer distance to the goal: each trial, and the median. Of tasks looked at once, only the ends are measured."
+    told = "Chamfer distance to the goal: each trial, and the median. Tasks looked at once: measured at both ends."
     page.figure(curves(groups), told)
     page.write(work / "tasks.html")
 
