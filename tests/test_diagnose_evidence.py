@@ -52,6 +52,18 @@ def test_a_shift_is_found_among_candidates_without_one(twin: Twin) -> None:
     assert p[3] < 0.005 and (np.delete(p, 3) > 0.05).all()
 
 
+def test_gains_in_few_episodes_are_not_held_against_even_ones(twin: Twin) -> None:
+    """A patch: eight of sixteen episodes gain, one of them most. One in 256 flips does as well, and five candidates
+    make that 0.02 at most; the four beside it, with even gains of either sign, would reach twice its t by chance.
+    """
+    patch = np.array([0.64, 0.05, 0.81, 0.07, 0.99, 1.64, 0.02, 0.17] + [0.0] * 8)
+    even = np.where(np.random.default_rng(2).random((4, 16)) < 0.5, 0.1, -0.1)
+    p = family_wise(gains(twin, np.vstack((patch, even))), 0)
+    assert p[0] < 0.025
+    t = patch.mean() / patch.std(ddof=1) * 4.0
+    assert t < 2.4 and (even.mean(axis=1) / even.std(axis=1, ddof=1) * 4.0).max() > 0.0
+
+
 def test_few_recordings_are_flipped_by_episodes(twin: Twin) -> None:
     """Sixteen episodes of six recordings, in two of which nothing acts: signs of recordings cannot fall below
     2^-4 = 0.06, whatever the gain; those of episodes can. With twelve recordings they are flipped together.

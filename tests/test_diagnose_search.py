@@ -80,7 +80,8 @@ def test_a_base_that_was_identified_too_soft_is_made_stiffer_on_the_reference() 
     space = make_trial(bench.twin, (), ("stiffness",)).space
     points = [space.start(), *(np.array([space.knobs[0].coordinate(k)]) for k in (20.0, 50.0))]
     assert bench.reference is not None
-    refined, before, truth = bench.reference.losses(space, points).mean(axis=1)
+    in_full = dataclasses.replace(bench.reference, usual=1e9)
+    refined, before, truth = in_full.losses(space, points).mean(axis=1)
     assert refined < 1.1 * truth < 0.5 * before
 
 

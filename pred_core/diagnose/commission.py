@@ -13,7 +13,7 @@ from torch import Tensor
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.fit import Target, fit
 from pred_core.diagnose.journal import Journal, vector
-from pred_core.diagnose.judge import Bench, Tell
+from pred_core.diagnose.judge import Bench, Tell, scaled
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.sample import Sample, make_sample
 from pred_core.diagnose.trial import make_trial
@@ -86,7 +86,7 @@ def commission(
         other = Target(roller, _weigh(roller, as_it_is, config, misfit), config.stride)
     physics = () if known is not None else base_fields(twin)
     train = np.flatnonzero(np.array([s == "train" for s in sample.splits]))
-    return Bench(twin, target, target.part(train.tolist()), twin, other, config, (), physics)
+    return scaled(Bench(twin, target, target.part(train.tolist()), twin, other, config, (), physics))
 
 
 def _weigh(roller: Roller, candidate: Candidate, config: DiagnoseConfig, misfit: Tensor | None) -> Weights:
@@ -146,7 +146,7 @@ def refined(
     twin: Twin, target: Target, tell: Tell | None, steps: int = 8, beside: tuple[type[Effect], ...] = ()
 ) -> Twin:
     """The base, and effects `beside` it, refined on a target whose weights stay."""
-    own = Target(Roller(twin, target.roller.sample), target.weights, target.stride)
+    own = dataclasses.replace(target, roller=Roller(twin, target.roller.sample))
     trial = make_trial(twin, beside, base_fields(twin))
     result = fit(own, trial.space, trial.space.start(), steps)
     if tell is not None:

@@ -14,7 +14,7 @@ from pred_core.effects import find_effect
 from pred_core.types import Array
 
 FLIPS = 20_000
-TIE = 1e-9  # relative: the unflipped draw must count, whatever its rounding
+DIGITS = 9  # of a sum of gains, as a share of their sizes: the unflipped draw must count, whatever its rounding
 FEWEST_GROUPS = 10  # 2^-10 is the smallest p value they can show; with six a single quiet one decides
 ACTS = 0.1  # standard deviations of a residual by which a cause must move an episode to count as acting in it
 NESTED = 0.03  # of the best gain: with fewer parameters, so little less is the better name
@@ -85,7 +85,10 @@ class Judged:
 
 
 def family_wise(judged: Sequence[Judged], seed: int, groups: NDArray[np.int64] | None = None) -> Array:
-    """(C,) p values, adjusted for these candidates: max-T over random sign flips (Westfall and Young 1993).
+    """(C,) p values, adjusted for these candidates: min-P over random sign flips (Westfall and Young 1993).
+
+    Each candidate's mean gain is compared with its own flips, and the smallest of these p values with the smallest of
+    every flip: so gains that lie in few episodes (a patch) are not held against what even ones could reach.
 
     `groups` (E,): recordings, whose episodes are flipped together; from fewer than FEWEST_GROUPS, which tell too
     little apart, episodes are flipped one by one. No parameter was fitted on the recording that it is judged on, so
@@ -98,22 +101,12 @@ def family_wise(judged: Sequence[Judged], seed: int, groups: NDArray[np.int64] |
     if unit.max() + 1 < FEWEST_GROUPS:
         unit = np.arange(gains.shape[1])
     signs = generator.choice((-1.0, 1.0), size=(FLIPS, int(unit.max()) + 1))[:, unit]
-    observed = _studentized(gains)
-    scale = np.sqrt((gains**2).sum(axis=1))  # sum of squares does not change with signs
-    sums = signs @ gains.T  # (F, C)
-    count = gains.shape[1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        means = sums / count
-        variance = (scale**2 / count - means**2) * count / (count - 1)
-        flipped = np.where(variance > 0, means / np.sqrt(variance / count), 0.0)
-    largest = flipped.max(axis=1)
-    return np.asarray((1 + (largest[None] >= (observed - TIE * np.abs(observed))[:, None]).sum(axis=1)) / (1 + FLIPS))
-
-
-def _studentized(gains: Array) -> Array:
-    count = gains.shape[1]
-    spread = gains.std(axis=1, ddof=1)
-    return np.where(spread > 0, gains.mean(axis=1) / np.maximum(spread, 1e-300) * np.sqrt(count), 0.0)
+    sums = np.concatenate((gains.sum(axis=1)[None], signs @ gains.T))  # (1 + F, C)
+    sums = np.round(sums / np.maximum(np.abs(gains).sum(axis=1), 1e-300), DIGITS)  # equal sums must compare equal
+    ordered = np.sort(sums, axis=0)
+    least = np.stack([np.searchsorted(o, s, side="left") for o, s in zip(ordered.T, sums.T, strict=True)], axis=1)
+    p = 1.0 - least / len(sums)  # share of draws, the unflipped one among them, with as large a sum
+    return np.asarray((p.min(axis=1)[:, None] <= p[0]).mean(axis=0))
 
 
 def rivals(judged: Sequence[Judged], best: Judged) -> list[tuple[Judged, float]]:

@@ -1,11 +1,14 @@
 """Fitting a candidate's parameters to a sample: robust Levenberg-Marquardt on weighted residuals.
 
-The loss of an episode is the mean of rho(u) = sqrt(1 + u^2) - 1 over its windows, frames, seen particles and
-coordinates, u the residual in standard deviations (`weigh`).
+The loss of a window is the mean of rho(u) = sqrt(1 + u^2) - 1 over its frames, seen particles and coordinates, u the
+residual in standard deviations (`weigh`); of an episode the mean over its windows of c log(1 + loss / c), c the usual
+loss of a window as things stand. So a window in which the object goes another way altogether (a rope that whips, or
+sticks a moment longer) counts like a few others, and decides neither what a parameter is nor whether there is a cause.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,6 +22,8 @@ from pred_core.diagnose.weigh import Weights, seen_of
 from pred_core.identify.space import SearchSpace
 from pred_core.types import Array
 
+USUAL = 1.0  # loss of a window from which it counts less, at least: noise and what engines differ by leave 0.4 to 0.6
+IN_FULL = 1e9  # a usual loss beyond any
 STEP = 0.05  # of a difference, in coordinates (typical changes)
 LONGEST = 2.0  # coordinates a step; twice as many after each step that was cut and helped
 CUT = 1.0 - 1e-9  # of the longest step, from which one counts as cut: rounding may take the rest
@@ -46,22 +51,35 @@ class Target:
     roller: Roller
     weights: Weights  # (W, K, N)
     stride: int
+    usual: float = USUAL  # loss of a window from which it counts less
 
     def part(self, episodes: Sequence[int]) -> Target:
         """Only some episodes."""
         sample = self.roller.sample
         keep = sample.windows_of(episodes)
-        return Target(Roller(self.roller.twin, sample.part(episodes)), self.weights[torch.as_tensor(keep)], self.stride)
+        roller = Roller(self.roller.twin, sample.part(episodes))
+        return dataclasses.replace(self, roller=roller, weights=self.weights[torch.as_tensor(keep)])
 
     def some(self, windows: NDArray[np.int64]) -> Target:
         """Only some windows."""
         roller = Roller(self.roller.twin, self.roller.sample.some(windows))
-        return Target(roller, self.weights[torch.as_tensor(windows)], self.stride)
+        return dataclasses.replace(self, roller=roller, weights=self.weights[torch.as_tensor(windows)])
+
+    def counting(self, usual: float) -> Target:
+        """The same where another loss is usual; IN_FULL: no window counts less than it is."""
+        return dataclasses.replace(self, usual=usual)
 
     def losses(self, space: SearchSpace, points: Sequence[Array]) -> Array:
         """(C, E) losses of points."""
-        u = self.residuals(space, points)
-        return self.per_episode(rho(u))
+        return self.losses_of(self.residuals(space, points))
+
+    def losses_of(self, u: Tensor) -> Array:
+        """(C, E) losses of residuals (C, W, K, N, 3) in standard deviations."""
+        return self.roller.sample.per_episode(counted(self.per_window(rho(u)), self.usual))
+
+    def counts(self, u: Tensor) -> Array:
+        """(W,) the derivative of what a window adds to its episode's loss by its own loss; u (W, K, N, 3)."""
+        return np.asarray(1.0 / (1.0 + self.per_window(rho(u[None]))[0] / self.usual))
 
     def residuals(self, space: SearchSpace, points: Sequence[Array], substeps: int | None = None) -> Tensor:
         """(C, W, K, N, 3) in standard deviations."""
@@ -70,10 +88,13 @@ class Target:
 
     def per_episode(self, values: Tensor) -> Array:
         """(C, E) means of values (C, W, K, N, 3) over what is seen."""
+        return self.roller.sample.per_episode(self.per_window(values))
+
+    def per_window(self, values: Tensor) -> Array:
+        """(C, W) means of values (C, W, K, N, 3) over what is seen."""
         seen = seen_of(self.roller, self.stride)
         count = (3 * seen.sum(dim=(1, 2))).clamp_min(1).double()
-        mean = values.sum(dim=(2, 3, 4)).double() / count
-        return self.roller.sample.per_episode(mean.numpy())
+        return np.asarray((values.sum(dim=(2, 3, 4)).double() / count).numpy())
 
     def linearize(self, space: SearchSpace, z: Array) -> tuple[Array, Array, Array, int]:
         """(losses (E,), gradients (E, P), curvatures (E, P, P), substeps) at z by one-sided differences."""
@@ -88,7 +109,7 @@ class Target:
         slopes = slopes.clamp_(-1e3, 1e3)
         soft = (1.0 + now.square()).rsqrt()
         seen = seen_of(self.roller, self.stride)
-        count = (3 * seen.sum(dim=(1, 2))).clamp_min(1).double().numpy()
+        count = (3 * seen.sum(dim=(1, 2))).clamp_min(1).double().numpy() / self.counts(now)
         flat = slopes.flatten(2)  # (P, W, R)
         weighted = flat * soft.flatten(1)
         gradient = torch.einsum("pwr,wr->wp", weighted, now.flatten(1)).double().numpy() / count[:, None]
@@ -96,11 +117,16 @@ class Target:
         sample = self.roller.sample
         per = sample.per_episode
         return (
-            self.per_episode(rho(now[None]))[0],
+            self.losses_of(now[None])[0],
             per(gradient.T).T,
             per(curvature.transpose(1, 2, 0)).transpose(2, 0, 1),
             substeps,
         )
+
+
+def counted(loss: Array, usual: float) -> Array:
+    """What the losses of windows count: usual log(1 + loss / usual), whatever their shape."""
+    return np.asarray(usual * np.log1p(loss / usual))
 
 
 def rho(u: Tensor) -> Tensor:
@@ -140,7 +166,7 @@ def fit(
                 damping *= 8.0
                 continue
             finer = max(substeps, target.roller.substeps([space.candidate(trial)]))
-            tried = target.per_episode(rho(target.residuals(space, [trial], finer)))[0]
+            tried = target.losses_of(target.residuals(space, [trial], finer))[0]
             after = float(tried[use].mean()) + 0.5 * PRIOR * float(((trial - origin) ** 2).sum())
             if after < before:
                 found = trial
@@ -154,6 +180,15 @@ def fit(
         if before - after < CONVERGED * before:
             break
     return Fit(z, loss, gradient, curvature)
+
+
+def graduated(target: Target, space: SearchSpace, z: Array, iterations: int, most: float = MOST_FACTOR) -> Fit:
+    """The optimum near z, first with all windows in full, whose valley is wider, then as they count.
+
+    Graduated non-convexity (Blake and Zisserman, Visual Reconstruction, 1987).
+    """
+    wide = fit(target.counting(IN_FULL), space, z, iterations, most=most)
+    return fit(target, space, wide.z, iterations, most=most)
 
 
 def _within(

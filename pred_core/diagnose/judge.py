@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import ACTS, Judged
-from pred_core.diagnose.fit import Target, fit, rho, without_groups
+from pred_core.diagnose.fit import IN_FULL, USUAL, Target, fit, graduated, rho, without_groups
 from pred_core.diagnose.journal import Journal, vector
 from pred_core.diagnose.search import Start, starts
 from pred_core.diagnose.trial import Trial, make_trial, scanned
@@ -50,10 +51,26 @@ class Bench:
         """A candidate on the suspect set."""
         return make_trial(self.twin, effects, self.physics, self.free)
 
+    def counting(self, usual: float) -> Bench:
+        """The same where another loss is usual of a window."""
+        return dataclasses.replace(
+            self,
+            target=self.target.counting(usual),
+            fitted=self.fitted.counting(usual),
+            reference=None if self.reference is None else self.reference.counting(usual),
+        )
+
     def standing(self) -> Array:
         """(E,) losses of the suspect set as the twin is."""
         space = make_trial(self.twin, (), ()).space
         return self.target.losses(space, [space.start()])[0]
+
+
+def scaled(bench: Bench) -> Bench:
+    """The bench whose windows count in full up to the median loss of the suspect set as the twin is."""
+    space = make_trial(bench.twin, (), ()).space
+    loss = bench.target.per_window(rho(bench.target.residuals(space, [space.start()])))
+    return bench.counting(max(USUAL, float(np.median(loss))))
 
 
 @dataclass(frozen=True)
@@ -77,7 +94,7 @@ def screen(bench: Bench, effects: Effects, rng: np.random.Generator, journal: Jo
     trial = bench.trial(effects)
 
     def find() -> list[list[object]]:
-        found = starts(bench.fitted, trial, bench.config.places, rng)[:KEPT_STARTS]
+        found = starts(bench.fitted.counting(IN_FULL), trial, bench.config.places, rng)[:KEPT_STARTS]
         return [[s.z.tolist(), s.promise] for s in found]
 
     def read(rows: Any) -> Screened:
@@ -88,18 +105,18 @@ def screen(bench: Bench, effects: Effects, rng: np.random.Generator, journal: Jo
 
 
 def quick(bench: Bench, screened: Screened, journal: Journal, key: str) -> tuple[Array, float]:
-    """(coordinates, loss on the train episodes) after a few steps from each start."""
+    """(coordinates, loss on the train episodes, windows in full) after a few steps from each start."""
 
     def find() -> list[object]:
-        trial = screened.trial
-        ends = [fit(bench.fitted, trial.space, s.z, QUICK, most=trial.most) for s in screened.starts[:TRIED]]
+        trial, fitted = screened.trial, bench.fitted.counting(IN_FULL)
+        ends = [fit(fitted, trial.space, s.z, QUICK, most=trial.most) for s in screened.starts[:TRIED]]
         best = min(ends, key=lambda f: float(f.loss.mean()))
         before = float("inf")
         for _ in range(ON_THE_WAY):  # a strong cause is far from off: as long as it gains much, it is not there yet
             if float(best.loss.mean()) > STILL_FALLING * before:
                 break
             before = float(best.loss.mean())
-            best = fit(bench.fitted, trial.space, best.z, QUICK, most=trial.most)
+            best = fit(fitted, trial.space, best.z, QUICK, most=trial.most)
         return [best.z.tolist(), float(best.loss.mean())]
 
     size = len(screened.trial.space.knobs)
@@ -122,7 +139,7 @@ def null_of(bench: Bench, screened: Screened, found: Array) -> Array:
     begins = [_like(trial, other, found)]
     if not any(scanned(e) for e in screened.effects):
         begins.append(other.space.start())
-    ends = [fit(bench.reference, other.space, z, bench.config.iterations, most=trial.most) for z in begins]
+    ends = [graduated(bench.reference, other.space, z, bench.config.iterations, trial.most) for z in begins]
     best = min(ends, key=lambda f: float(f.loss.mean()))
     off = float(bench.reference.losses(other.space, [other.space.start()]).mean())
     if float(best.loss.mean()) > (1.0 - HARDLY) * off:
@@ -140,7 +157,7 @@ def _back_fit(bench: Bench, screened: Screened, found: Array) -> Array:
     getting the base out of a local optimum."""
     base = make_trial(bench.twin, (), bench.physics, bench.free)
     begins = (base.space.start(), _like(screened.trial, base, found))
-    ends = [fit(bench.fitted, base.space, z, bench.config.iterations) for z in begins]
+    ends = [graduated(bench.fitted, base.space, z, bench.config.iterations) for z in begins]
     best = min(ends, key=lambda f: float(f.loss.mean()))
     return _like(base, screened.trial, best.z)
 
@@ -180,12 +197,12 @@ def _judge(bench: Bench, screened: Screened) -> dict[str, object]:
     """Plain values of a candidate: coordinates, those without each recording, gains and losses per episode."""
     trial, space, target = screened.trial, screened.trial.space, bench.target
     train = bench.train
-    result = fit(bench.fitted, trial.space, screened.starts[0].z, bench.config.iterations, most=trial.most)
+    result = graduated(bench.fitted, trial.space, screened.starts[0].z, bench.config.iterations, trial.most)
     null = null_of(bench, screened, result.z)
     sample = target.roller.sample
     left_out = without_groups(result, space, sample.groups[train])
     u = target.residuals(space, [null, result.z, *left_out.values()])
-    losses = target.per_episode(rho(u))
+    losses = target.losses_of(u)
     extended = losses[1].copy()
     for row, group in enumerate(left_out if bench.config.cross_fit else ()):
         mine = sample.groups == group  # also test episodes of that recording

@@ -11,6 +11,7 @@ from pred_core.diagnose.progress import Named, Progress, Round
 from pred_core.diagnose.result import Ranked
 
 SHARP = 1.0  # how fast a rival's weight falls with the standard errors it is behind
+OCCAM = 0.5  # weight of a rival for each parameter that it has beyond the best one's
 COLD = 0.8  # without a reference: what engine and object lack in common can look like a cause
 UNSEEN = 0.05  # probability left for "none" where something is seen that no candidate explains
 FOUND = 0.88, 0.05  # share of hidden effects (75 of 85 seen cases) that give a family-wise p below this
@@ -87,7 +88,11 @@ def _finalists(first: Round, chosen: Named | None, sure: float) -> list[Ranked]:
     judged = [j for j, _, _ in first.judged]
     best = chosen.judged if chosen else min(judged, key=lambda j: j.left)
     apart = {j.trial.id for j in judged if elsewhere(j, best)}
-    weight = {j.trial.id: math.exp(-SHARP * max(z, 0.0)) for j, z in rivals(judged, best) if j.trial.id not in apart}
+    weight = {
+        j.trial.id: math.exp(-SHARP * max(z, 0.0)) * OCCAM ** max(j.parameters - best.parameters, 0)
+        for j, z in rivals(judged, best)
+        if j.trial.id not in apart
+    }
     p = {j.trial.id: (q, why) for j, q, why in first.judged}
     allowed = {k: w for k, w in weight.items() if not p[k][1] or (chosen is not None and k == best.trial.id)}
     total = sum(allowed.values()) or 1.0

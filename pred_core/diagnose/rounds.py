@@ -9,7 +9,8 @@ import numpy as np
 
 from pred_core.diagnose.commission import with_values
 from pred_core.diagnose.evidence import Judged, lack_of_fit
-from pred_core.diagnose.judge import QUICK, Bench, Effects, Screened, Tell, judge, quick, rng_of, screen
+from pred_core.diagnose.fit import IN_FULL, counted
+from pred_core.diagnose.judge import QUICK, Bench, Effects, Screened, Tell, judge, quick, rng_of, scaled, screen
 from pred_core.diagnose.naming import FEWEST, LEFT, STANDING, choose
 from pred_core.diagnose.pairs import try_pairs
 from pred_core.diagnose.progress import Progress, Round
@@ -22,11 +23,12 @@ from pred_core.types import Array
 
 GATE_ONLY = ("gripper_offset", "gripper_rotation")  # absorbed by measured starts: the model-free gate names them
 WORTH = 0.03  # of the floor: what a candidate must promise to be fitted to the end
-SURE = 0.01  # p value of a lack of fit
+SURE = 0.02  # p value of a lack of fit
 FEW, FINALISTS = 2, 5  # candidates that are fitted to the end: at least, and at most
 BEHIND = 0.35  # share of the leader's gain below which the others are not
-UNEXPLAINED = 3.0  # times the loss of noise: without a reference, what is left is then worth saying
 NOISE = 0.4  # loss of residuals that are noise: the mean of rho(u) for u ~ N(0, 1) is 0.36
+UNEXPLAINED = 1.2  # loss beyond which, without a reference, what is left is worth saying
+USUALLY = 3.0  # times the reference's loss: the same where there are too few episodes for a test
 CLOSE = 0.6  # share of the promise of its family's leader from which a candidate is kept beside it
 
 
@@ -103,7 +105,7 @@ def _something_left(progress: Progress, base: Array, floor: float) -> bool:
     first = progress.rounds[0]
     whole = float(first.base.mean()) - first.floor
     if progress.bench.reference is None:
-        return float(base.mean()) > NOISE
+        return float(base.mean()) > _counts(progress.bench, NOISE)
     return float(base.mean()) - floor > max(progress.bench.config.gate * whole, STANDING * floor)
 
 
@@ -114,12 +116,12 @@ def finish(progress: Progress) -> None:
     progress.explained = None if found is None else found.share
     poor = found is not None and found.share < POOR
     if bench.reference is None:
-        loud = not progress.named and float(bench.standing().mean()) > UNEXPLAINED * NOISE
+        loud = not progress.named and float(bench.standing().mean()) > _counts(bench, UNEXPLAINED)
         progress.unknown = loud or poor
         return
     suspect, reference = bench.standing(), _reference_losses(bench)
     if min(len(suspect), len(reference)) < FEWEST:
-        loud = float(suspect.mean()) > UNEXPLAINED * float(reference.mean())
+        loud = float(suspect.mean()) > USUALLY * float(reference.mean())
         progress.unknown = not progress.named and (loud or poor)
         return
     p = lack_of_fit(
@@ -139,7 +141,12 @@ def extend(bench: Bench, judged: Judged) -> Bench:
     kept = tuple(changed.pop(e.id, e) for e in bench.reference_twin.extensions) + tuple(changed.values())
     reference = bench.reference_twin.replace(extensions=kept)
     free = (*bench.free, *judged.trial.ids)
-    return dataclasses.replace(bench, twin=twin, reference_twin=reference, free=free)
+    return scaled(dataclasses.replace(bench, twin=twin, reference_twin=reference, free=free))
+
+
+def _counts(bench: Bench, loss: float) -> float:
+    """What a set counts all windows of which have this loss."""
+    return float(counted(np.array(loss), bench.target.usual))
 
 
 def _reference_losses(bench: Bench) -> Array:
@@ -166,7 +173,7 @@ def _halve(
 ) -> list[Screened]:
     """The candidates that lead after a few steps: a straight line promises little of a localized cause."""
     bench = progress.bench
-    before = float(bench.standing()[bench.train].mean())
+    before = float(bench.counting(IN_FULL).standing()[bench.train].mean())
     rows = []
     for s in kept:
         z, loss = quick(bench, s, progress.journal, f"{number}/quick/{s.trial.id}")

@@ -147,7 +147,7 @@ def coordinates(space: SearchSpace, candidate: Candidate) -> Array:
 def _normal(target: Target, now: torch.Tensor, moved: torch.Tensor, steps: Array) -> tuple[Array, Array]:
     """Gradient (k,) and curvature (k, k) of the mean loss along the switches."""
     slopes = (moved - now) / torch.as_tensor(steps, dtype=torch.float32).reshape(-1, 1, 1, 1, 1)
-    soft = (1.0 + now.square()).rsqrt()
+    soft = (1.0 + now.square()).rsqrt() * torch.as_tensor(target.counts(now), dtype=now.dtype)[:, None, None, None]
     g = target.per_episode(slopes * (now * soft)).mean(axis=1)
     k = len(steps)
     h = np.empty((k, k))

@@ -13,12 +13,11 @@ import numpy as np
 
 from pred_core.diagnose.commission import base_fields, refined, values_of, with_stored
 from pred_core.diagnose.evidence import Judged, family_wise
-from pred_core.diagnose.fit import Target, rho
+from pred_core.diagnose.fit import Target
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Bench, Tell
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.trial import Trial, make_trial
-from pred_core.diagnose.weigh import Weights
 from pred_core.effects import find_effect
 from pred_core.effects.effect import Effect
 from pred_core.identify.space import Candidate
@@ -174,12 +173,11 @@ def _damped(twin: Twin, time: float) -> Twin:
 def _losses(twin: Twin, target: Target) -> Array:
     """(E,) of a twin with the target's weights."""
     u = Roller(twin, target.roller.sample).errors([Candidate(twin.physics, twin.extensions)], target.stride)
-    return target.per_episode(rho(u * target.weights[..., None]))[0]
+    return target.losses_of(u * target.weights[..., None])[0]
 
 
 def _on(twin: Twin, target: Target) -> Target:
-    weights: Weights = target.weights
-    return Target(Roller(twin, target.roller.sample), weights, target.stride)
+    return dataclasses.replace(target, roller=Roller(twin, target.roller.sample))
 
 
 def _trial(twin: Twin) -> Trial:
