@@ -121,7 +121,7 @@ def _header(dataset: Dataset, reference: Dataset | None, twin: Twin, config: Dia
     hashes = [[s.sha256(e) for e in s.entries] for s in sets]
     facts = [repr((s.entries, s.held, s.gravity, s.known, s.sigma)) for s in sets]
     plain = dataclasses.replace(config, seconds=DiagnoseConfig().seconds)
-    asked = {"twin": twin.digest(), "levers": repr(twin.meta.levers), "config": repr(plain), "version": 2}
+    asked = {"twin": twin.digest(), "levers": repr(twin.meta.levers), "config": repr(plain), "version": 3}
     return {"data": hashes, "facts": facts, **asked}
 
 
