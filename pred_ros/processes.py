@@ -16,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 
 from pred_core.errors import ConfigError, nearest
+from pred_ros import shared_memory
 from pred_ros.resources import fastdds_profile
 
 # A node started with this variable ends when its parent is gone, however that ended.
@@ -122,7 +123,7 @@ class Children:
         return lines[-1] if lines else ""
 
     def end(self) -> None:
-        """SIGINT to all, then SIGKILL to what stays of their process groups."""
+        """SIGINT to all, then SIGKILL to what stays of their process groups; sweep the shared memory of the killed."""
         for process in self.running.values():
             _signal_group(process, signal.SIGINT)
         deadline = time.monotonic() + self.polite
@@ -131,6 +132,7 @@ class Children:
                 process.wait(max(0.0, deadline - time.monotonic()))
             _signal_group(process, signal.SIGKILL)
             process.wait()
+        shared_memory.sweep()
 
 
 def _signal_group(process: subprocess.Popen[bytes], number: signal.Signals) -> None:

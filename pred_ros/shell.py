@@ -90,6 +90,11 @@ class Shell(LifecycleNode):
         """End what `start` began; join threads. Called once, also after errors."""
         raise NotImplementedError
 
+    def destroy_node(self) -> None:
+        """Destroy the node and its lifecycle state machine: while that holds it, its shared memory stays."""
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
     def heartbeat(self) -> None:
         """Called once a second before diagnostics go out."""
 
