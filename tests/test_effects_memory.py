@@ -117,7 +117,8 @@ def bend(id: str, kb: float, memory: tuple[float, ...] = (), rest: float = 0.0, 
     kept = tuple(t(m) for m in memory)
     at = BendContext(curvature=(t(kb), t(0.0)), change=(t(0.0), t(0.0)), weight=t(1.0), length=t(0.05),
                      bends=t(1.0), substep=t(0.01), arc=t(0.5), time=t(120.0), memory=kept,
-                     rest=(t(rest), t(0.0)))  # fmt: skip
+                     rest=(t(rest), t(0.0)), handed=(t(0.0),) * effect.line_values,
+                     arrived=(t(0.0),) * effect.line_values)  # fmt: skip
     moment, _, memory_after = effect.bend(p, at)
     return float(moment), [float(m) for m in memory_after]
 
@@ -131,7 +132,7 @@ def test_bending_laws_by_hand() -> None:
     assert kept[0] == pytest.approx(0.2) and moment == pytest.approx(-0.2)
     assert bend("bending_plasticity", 0.24, (0.05, 0.0), radius=0.25)[1][0] == pytest.approx(0.05)
     # 3 /m on an edge of 0.05 m.
-    assert bend("rest_bow", 0.0, curvature=(3.0,))[0] == pytest.approx(-0.15)
+    assert bend("rest_bow", 0.0, (0.0,), curvature=(3.0,))[0] == pytest.approx(-0.15)
     # kappa = 0.2/0.05 = 4 /m, a = 0.0625 m^2: x = 1, saturating at 4: 0.8 of EI more; a = -0.0625: 1/2.25 less.
     assert bend("bending_stiffening", 0.2, gain=0.0625)[0] == pytest.approx(0.8 * 0.2)
     assert bend("bending_stiffening", 0.2, gain=-0.0625)[0] == pytest.approx(-0.2 / 2.25)

@@ -178,5 +178,6 @@ def _shared_memory(twin: Twin) -> int:
 
     They are alike in all worlds: a probe acts for one period at a time.
     """
-    laws = sum(find_effect(e.id).bend_memory for e in twin.extensions)
-    return 4 * len(chains(twin.body)) + (2 + laws) * len(twin.body.bends)
+    laws = [find_effect(e.id) for e in twin.extensions]
+    per_line, per_bend = 4 + sum(e.line_values for e in laws), 2 + sum(e.bend_memory for e in laws)
+    return per_line * len(chains(twin.body)) + per_bend * len(twin.body.bends)

@@ -81,6 +81,10 @@ class BendContext:
     time: Any  # [s]
     memory: tuple[Any, ...]  # `bend_memory` values this effect left here in the last substep; 0 at the start
     rest: tuple[Any, Any] = (0.0, 0.0)  # what other effects' `rest_shape` say, for effects that have one
+    handed: tuple[Any, ...] = ()  # `line_values` this effect handed on at the bend before; 0 at a line's first
+    arrived: tuple[Any, ...] = ()  # the same at the line's last bend, in the last substep; 0 at the start
+    first_held: Any = 0.0  # 1 where a gripper holds the line's first edge, else 0
+    last_held: Any = 0.0
 
 
 @dataclass(frozen=True)
@@ -135,6 +139,7 @@ class Effect:
     parameters: ClassVar[tuple[Parameter, ...]]
     confounded_with: ClassVar[tuple[str, ...]] = ()
     bend_memory: ClassVar[int] = 0  # values a `bend` hook keeps per bend
+    line_values: ClassVar[int] = 0  # values a `bend` hook hands on along a line, from bend to bend
     grip_memory: ClassVar[int] = 0  # values a `boundary` hook keeps per held particle, moved on by `slide`
     end_twist: ClassVar[str] = ""  # the parameter [rad] by which a line's far material axes are turned in its gripper
 
@@ -150,7 +155,7 @@ class Effect:
 
     @classmethod
     def bend(cls, p: Mapping[str, Any], at: BendContext) -> tuple[Any, Any, tuple[Any, ...]]:
-        """(moment, moment) [N m] added along the two material axes, and the new memory."""
+        """(moment, moment) [N m] added along the two material axes; the new memory, then what is handed on."""
         raise AttributeError(f"{cls.id} has no bend hook")
 
     @classmethod

@@ -118,6 +118,8 @@ def kernel_text(effects: tuple[type[Effect], ...], lanes: int, staged: bool) -> 
         "@BEND_FRAME@": source_bending.BEND_FRAME if framed else "",
         "@BEND_MOMENT@": source_bending.BEND_MOMENT if framed else "",
         "@END_TWIST@": end_twist(effects),
+        "@LINE_VALUES@": str(sum(e.line_values for e in effects)),
+        "@LINE_PLACE@": f"4 * K + {2 + sum(e.bend_memory for e in effects)} * B",
     }
     laws = law_statements(effects)
     parts |= {"@LOAD@": source_contact.LOAD if grips else "", "@GRIP_SLOTS@": str(grips)}

@@ -169,11 +169,15 @@ def _boundary(code: Code, p: dict[str, Any], effect: type[Effect], kept: list[st
 
 def _bends(effects: tuple[type[Effect], ...]) -> list[str]:
     """Moments along the directors; effects' memory slots follow the two of the curvature and are all read first."""
-    kept, laws, slot = [], [], 0
+    kept, laws, slot, value_slot = [], [], 0, 0
     for number, effect in enumerate(effects):
         places = [f"memory[4 * K + (2 + {slot + k}) * B + b]" for k in range(effect.bend_memory)]
         kept += [f"const Lane kept{number}_{k} = lane_select(fresh > zero, zero, {p});" for k, p in enumerate(places)]
+        handed = range(value_slot, value_slot + effect.line_values)
+        kept += [f"const Lane handed{number}_{k} = handed[{n}];" for k, n in enumerate(handed)]
+        places += [f"handed[{n}]" for n in handed]
         slot += effect.bend_memory
+        value_slot += effect.line_values
         if "bend" in effect.hooks:
             code = Code(f"bend{number}_")
             p, at = _bend(code, effects, number)
@@ -190,6 +194,8 @@ def _bends(effects: tuple[type[Effect], ...]) -> list[str]:
 def _bend(code: Code, effects: tuple[type[Effect], ...], number: int) -> tuple[dict[str, Any], BendContext]:
     """Parameters and context of one effect's bend hooks."""
     row = BASE_PARAMETERS + sum(q.size for e in effects[:number] for q in e.parameters)
+    first = sum(e.line_values for e in effects[:number])
+    values = effects[number].line_values
     at = BendContext(
         curvature=(_value(code, "k1"), _value(code, "k2")),
         change=(_value(code, "change1"), _value(code, "change2")),
@@ -200,5 +206,9 @@ def _bend(code: Code, effects: tuple[type[Effect], ...], number: int) -> tuple[d
         arc=_value(code, "Lane(e[2])"),
         time=_value(code, "time"),
         memory=tuple(_value(code, f"kept{number}_{k}") for k in range(effects[number].bend_memory)),
+        handed=tuple(_value(code, f"handed{number}_{k}") for k in range(values)),
+        arrived=tuple(_value(code, f"arrived[{first + k}]") for k in range(values)),
+        first_held=_value(code, "first_held"),
+        last_held=_value(code, "last_held"),
     )
     return _parameters(code, effects[number], row), at

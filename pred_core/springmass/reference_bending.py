@@ -25,6 +25,7 @@ class BendMemory:
     director: dict[int, Tensor] = field(default_factory=dict)  # per line (W, 3)
     curvature: Tensor | None = None  # (W, B, 2)
     effects: dict[int, tuple[Tensor, ...]] = field(default_factory=dict)  # per effect, (W, B) each
+    arrived: dict[tuple[int, int], tuple[Tensor, ...]] = field(default_factory=dict)  # effect, line: (W, 1) each
 
 
 def bend_forces(
@@ -73,25 +74,56 @@ def _moments(
     change = torch.zeros_like(now) if memory.curvature is None else now - memory.curvature
     memory.curvature = now
     counts = torch.cat([torch.full((e - s,), float(e - s), dtype=x.dtype) for s, e in sim.lines])[None]
-    first, second = torch.zeros_like(weight), torch.zeros_like(weight)
-    benders = sim.hooks("bend")
-    contexts = []
-    for number, (effect, _) in enumerate(benders):
-        kept = memory.effects.get(number, (torch.zeros_like(weight),) * effect.bend_memory)
-        at = BendContext(
-            (now[..., 0], now[..., 1]), (change[..., 0], change[..., 1]), weight, sim.bend_rows[:, 1][None],
-            counts, torch.tensor(h, dtype=x.dtype), sim.bend_rows[:, 2][None], time, kept,
-        )  # fmt: skip
-        contexts.append(at)
-    shapes = {
-        n: effect.rest_shape(p, contexts[n]) for n, (effect, p) in enumerate(benders) if "rest_shape" in effect.hooks
-    }
-    for number, (effect, p) in enumerate(benders):
-        others = [shape for n, shape in shapes.items() if n != number and number in shapes]
-        rest = sum((s[0] for s in others), 0.0), sum((s[1] for s in others), 0.0)
-        m1, m2, memory.effects[number] = effect.bend(p, replace(contexts[number], rest=rest))
-        first, second = first + m1, second + m2
+    everywhere = BendContext(
+        (now[..., 0], now[..., 1]), (change[..., 0], change[..., 1]), weight, sim.bend_rows[:, 1][None],
+        counts, torch.tensor(h, dtype=x.dtype), sim.bend_rows[:, 2][None], time, (),
+    )  # fmt: skip
+    rows: list[list[Tensor]] = []
+    for number, (begin, end) in enumerate(sim.lines):
+        ends = held[:, int(bends[begin, 0])], held[:, int(bends[end - 1, 2])]
+        rows += _along_line(sim, number, range(begin, end), everywhere, ends, memory)
+    first, second, *kept = (torch.cat(column, 1) for column in zip(*rows, strict=True))
+    for number, (effect, _) in enumerate(sim.hooks("bend")):
+        memory.effects[number] = tuple(kept[: effect.bend_memory])
+        kept = kept[effect.bend_memory :]
     return first, second, (d1, d2)
+
+
+def _along_line(
+    sim: Reference, line: int, places: range, everywhere: BendContext, ends: tuple[Tensor, Tensor], memory: BendMemory
+) -> list[list[Tensor]]:
+    """Per bend of a line: the two moments, then every effect's memory (W, 1), bend after bend: values are handed on."""
+    benders = sim.hooks("bend")
+    zero = torch.zeros_like(everywhere.weight[:, :1])
+    handed = {n: (zero,) * effect.line_values for n, (effect, _) in enumerate(benders)}
+    arrived = {n: memory.arrived.get((n, line), values) for n, values in handed.items()}
+    rows = []
+    for place in places:
+        here = slice(place, place + 1)
+        contexts = [
+            replace(
+                everywhere,
+                curvature=tuple(k[:, here] for k in everywhere.curvature),
+                change=tuple(k[:, here] for k in everywhere.change),
+                weight=everywhere.weight[:, here], length=everywhere.length[:, here], arc=everywhere.arc[:, here],
+                bends=everywhere.bends[:, here], handed=handed[n], arrived=arrived[n],
+                memory=tuple(m[:, here] for m in memory.effects.get(n, ())) or (zero,) * effect.bend_memory,
+                first_held=(ends[0] >= 0).to(zero.dtype)[:, None], last_held=(ends[1] >= 0).to(zero.dtype)[:, None],
+            )
+            for n, (effect, _) in enumerate(benders)
+        ]  # fmt: skip
+        shapes = {n: e.rest_shape(p, contexts[n]) for n, (e, p) in enumerate(benders) if "rest_shape" in e.hooks}
+        row = [zero, zero]
+        for n, (effect, p) in enumerate(benders):
+            others = [shape for k, shape in shapes.items() if k != n and n in shapes]
+            rest = sum((s[0] for s in others), 0.0), sum((s[1] for s in others), 0.0)
+            m1, m2, after = effect.bend(p, replace(contexts[n], rest=rest))
+            row[0], row[1] = row[0] + m1, row[1] + m2
+            row += [v + zero for v in after[: effect.bend_memory]]
+            handed[n] = after[effect.bend_memory :]
+        rows.append(row)
+    memory.arrived.update({(n, line): values for n, values in handed.items()})
+    return rows
 
 
 def _relative_stiffness(sim: Reference, time: Tensor) -> Tensor:

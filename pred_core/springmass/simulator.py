@@ -75,8 +75,9 @@ class SpringMass:
         self._lines = chains(body)
         framed = any("bend" in e.hooks for e in self.effects)
         slots = 2 + sum(e.bend_memory for e in self.effects)
-        # Per line the twist angle and a director, per bend two curvatures and what `bend` hooks keep.
-        frame_size = 4 * len(self._lines) + slots * len(body.bends) if framed else 0
+        values = 4 + sum(e.line_values for e in self.effects)
+        # Per line the twist angle, a director and what hooks hand on; per bend two curvatures and what hooks keep.
+        frame_size = values * len(self._lines) + slots * len(body.bends) if framed else 0
         self._line_ends = torch.as_tensor(line_ends(body)[: None if framed else 0], device=device)
         self._twists = slice(0, 4 * len(self._lines) if framed else 0, 4)
         self._grip_size = body.count * sum(e.grip_memory for e in self.effects)  # at the end: per slot and particle

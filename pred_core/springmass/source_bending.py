@@ -41,10 +41,13 @@ BEND = r"""
 FRAME = r"""
   const int* chains = (const int*)m.chains.data;  // (K, 2) first bend, one past the last
   const int K = m.chain_count;
-  Lane* memory = (Lane*)w.memory.data + (size_t)block * m.memory_count;  // (K, 4) phi and u, then (slot, B)
+  Lane* memory = (Lane*)w.memory.data + (size_t)block * m.memory_count;  // (K, 4) phi and u, (slot, B), (K, HANDED)
   const Lane* frame_grip = (const Lane*)w.frame_grip.data + (size_t)block * 2 * K;  // (K, 2) at either end, or -1
   Lane director[3] = {zero, zero, zero}, twist = zero, line_bends = zero;  // u at the edge before the next bend
   Lane fresh = zero;  // 1 in a world's first substep
+  // What laws hand on along a line: from bend to bend in this substep, and what arrived at its end in the last one.
+  constexpr int HANDED = @LINE_VALUES@;
+  Lane handed[HANDED + 1], arrived[HANDED + 1], first_held = zero, last_held = zero;
   auto lane_atan2 = [&](Lane y, Lane x) -> Lane {  // 1e-5 rad
     const Lane ax = lane_max(x, -x), ay = lane_max(y, -y);
     const Lane a = lane_min(ax, ay) / lane_max(lane_max(ax, ay), tiny), s = a * a;
@@ -111,6 +114,10 @@ FRAME = r"""
     const int begin = chains[2 * line], end = chains[2 * line + 1];
     Lane* kept = memory + 4 * line;
     line_bends = Lane((float)(end - begin));
+    first_held = lane_select(first < zero, zero, one); last_held = lane_select(last < zero, zero, one);
+    for (int v = 0; v < HANDED; ++v) {
+      handed[v] = zero; arrived[v] = lane_select(fresh > zero, zero, memory[@LINE_PLACE@ + HANDED * line + v]);
+    }
     Lane sx, sy, sz, ax, ay, az, bx, by, bz, r[3], d[3], u[3];
     tangent(bends[3 * begin], bends[3 * begin + 1], sx, sy, sz);
     clamp_director(first, -1.0f, period, alpha, sx, sy, sz, u[0], u[1], u[2]);
@@ -198,6 +205,7 @@ ONE_BEND = "if (element < B) bend_force(element, time);"
 FRAMED_LINE = r"""
         start_frame(line, period, alpha);
         for (int b = chains[2 * line]; b < chains[2 * line + 1]; ++b) bend_force(b, time);
+        for (int v = 0; v < HANDED; ++v) memory[@LINE_PLACE@ + HANDED * line + v] = handed[v];
 """
 FRESH = "fresh = period == 0 && sub == 0 ? lane_select(steps > zero, zero, one) : zero;"
 ALL_BENDS_FRAMED = FRESH + " for (int line = 0; line < K; ++line) {" + FRAMED_LINE + "      }"
