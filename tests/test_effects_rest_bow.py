@@ -24,7 +24,8 @@ ENDS = {"first": {0: 0, 1: 0}, "last": {11: 0, 10: 0}, "both": {0: 0, 1: 0, 10: 
 
 def settled(body: Body, held: dict[int, int], curvature: tuple[float, float]) -> tuple[State, Tensor]:
     """After 20 s in air that brakes: the state, and the memory of laws and frames."""
-    ends = torch.as_tensor(body.rest_position[[0, -1]] if len(held) > 2 else body.rest_position[[-1 if min(held) else 0]])
+    where = [0, -1] if len(held) > 2 else [-1 if min(held) else 0]
+    ends = torch.as_tensor(body.rest_position[where])
     causes = [LIBRARY["rest_bow"].extension(curvature=curvature), LIBRARY["drag_linear"].extension(coefficient=2.0)]
     sim = SpringMass(body, PHYSICS, SCENE, extensions=causes)
     begun = sim.start(holding(state_of(body.rest_position), held), still(ends.float()))
