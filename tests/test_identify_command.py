@@ -6,7 +6,6 @@ import dataclasses
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -30,6 +29,24 @@ ROOT = Path(__file__).parents[1]
 PLANT = line(8, 0.35, stiffness=60.0, bending=5e-4, drag=0.5)
 FLAGS = ["--evaluations", "100", "--restarts", "2", "--window", "0.5", "--stages", "0.5", "--windows", "6"]
 CONFIG = IdentifyConfig(evaluations=100, restarts=2, window=0.5, stages=(0.5,), windows=6)
+
+# The command in a process that gets Ctrl-C, a real one, while it evaluates for the fourth time.
+INTERRUPTED = """
+import os, signal, sys
+from pred_core.cli.main import main
+from pred_core.identify.journal import Journal
+
+evaluate, calls = Journal.evaluate, []
+
+def evaluated(self, *args):
+    calls.append(1)
+    if len(calls) == 4:
+        os.kill(os.getpid(), signal.SIGINT)
+    return evaluate(self, *args)
+
+Journal.evaluate = evaluated
+sys.exit(main())
+"""
 
 
 @pytest.fixture(scope="module")
@@ -71,17 +88,11 @@ def test_stopped_in_the_middle_and_run_again_gives_the_same_twin(data: Dataset, 
 
 
 def test_an_interrupted_command_goes_on(data: Dataset, whole: str, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "pred_core.cli.main", "identify", str(data.root), "--out", str(tmp_path), *FLAGS]
+    command = ["identify", str(data.root), "--out", str(tmp_path), *FLAGS]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while process.poll() is None and time.monotonic() < deadline:
-        if (tmp_path / JOURNAL).is_file() and len((tmp_path / JOURNAL).read_text().splitlines()) > 3:
-            process.send_signal(signal.SIGINT)
-            break
-        time.sleep(0.002)
-    _, errors = process.communicate(timeout=120)
-    assert process.returncode == 130 and "run the same command again" in errors, errors
+    process = [sys.executable, "-c", INTERRUPTED, *command]
+    done = subprocess.run(process, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 130 and "run the same command again" in done.stderr, done.stderr
     assert (tmp_path / JOURNAL).is_file() and not (tmp_path / "twin.yaml").exists()
     assert main(["identify", str(data.root), "--out", str(tmp_path), *FLAGS]) == 0
     assert Twin.load(tmp_path).digest() == whole

@@ -96,13 +96,16 @@ class Target:
         count = (3 * seen.sum(dim=(1, 2))).clamp_min(1).double()
         return np.asarray((values.sum(dim=(2, 3, 4)).double() / count).numpy())
 
-    def linearize(self, space: SearchSpace, z: Array) -> tuple[Array, Array, Array, int]:
-        """(losses (E,), gradients (E, P), curvatures (E, P, P), substeps) at z by one-sided differences."""
+    def linearize(self, space: SearchSpace, z: Array, least: int = 1) -> tuple[Array, Array, Array, int]:
+        """(losses (E,), gradients (E, P), curvatures (E, P, P), substeps) at z by one-sided differences.
+
+        With `least` substeps a period, or more where the points need them.
+        """
         lower, upper = (np.array(b) for b in space.bounds())
         step = np.where(z + STEP <= upper, STEP, -STEP)
         step = np.where((step < 0) & (z - STEP < lower), upper - z, step)
         points = [z, *(z + step[d] * np.eye(len(z))[d] for d in range(len(z)))]
-        substeps = self.roller.substeps([space.candidate(p) for p in points])
+        substeps = max(least, self.roller.substeps([space.candidate(p) for p in points]))
         u = self.residuals(space, points, substeps)
         now = u[0]
         slopes = (u[1:] - now) / torch.as_tensor(step, dtype=torch.float32).reshape(-1, 1, 1, 1, 1)
@@ -142,8 +145,12 @@ def fit(
     iterations: int,
     chosen: NDArray[np.bool_] | None = None,
     most: float = MOST_FACTOR,
+    slopes: bool = True,
 ) -> Fit:
     """The local optimum near z, on all episodes or on `chosen` (E,) bool.
+
+    Slopes are taken with every step that is tried: nearly all are taken. Without `slopes` those of the last step are
+    not: gradient and curvature are then the ones before it.
 
     Steps to where more than `most` times the substeps of the start are needed are cut: what the data do not show
     (axial damping) must not make the simulation slow, and what they do show must not wait for it.
@@ -155,7 +162,7 @@ def fit(
     damping, longest = 1e-2, LONGEST
     limit = most * max(target.roller.demand(space.candidate(z)), target.roller.usual())
     loss, gradient, curvature, substeps = target.linearize(space, z)
-    for _ in range(iterations):
+    for step in range(iterations):
         g = gradient[use].mean(axis=0) + PRIOR * (z - origin)
         h = curvature[use].mean(axis=0) + PRIOR * np.eye(len(z))
         before = float(loss[use].mean()) + 0.5 * PRIOR * float(((z - origin) ** 2).sum())
@@ -165,9 +172,12 @@ def fit(
             if trial is None:
                 damping *= 8.0
                 continue
-            finer = max(substeps, target.roller.substeps([space.candidate(trial)]))
-            tried = target.losses_of(target.residuals(space, [trial], finer))[0]
-            after = float(tried[use].mean()) + 0.5 * PRIOR * float(((trial - origin) ** 2).sum())
+            if slopes or step < iterations - 1:
+                tried = target.linearize(space, trial, substeps)
+            else:
+                finer = max(substeps, target.roller.substeps([space.candidate(trial)]))
+                tried = target.losses_of(target.residuals(space, [trial], finer))[0], gradient, curvature, finer
+            after = float(tried[0][use].mean()) + 0.5 * PRIOR * float(((trial - origin) ** 2).sum())
             if after < before:
                 found = trial
                 longest *= 2.0 if np.abs(trial - z).max() >= CUT * longest else 1.0
@@ -176,7 +186,7 @@ def fit(
         if found is None:
             break
         z, damping = found, max(damping / 6.0, 1e-6)
-        loss, gradient, curvature, substeps = target.linearize(space, z)
+        loss, gradient, curvature, substeps = tried
         if before - after < CONVERGED * before:
             break
     return Fit(z, loss, gradient, curvature)

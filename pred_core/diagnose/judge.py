@@ -109,14 +109,14 @@ def quick(bench: Bench, screened: Screened, journal: Journal, key: str) -> tuple
 
     def find() -> list[object]:
         trial, fitted = screened.trial, bench.fitted.counting(IN_FULL)
-        ends = [fit(fitted, trial.space, s.z, QUICK, most=trial.most) for s in screened.starts[:TRIED]]
+        ends = [fit(fitted, trial.space, s.z, QUICK, most=trial.most, slopes=False) for s in screened.starts[:TRIED]]
         best = min(ends, key=lambda f: float(f.loss.mean()))
         before = float("inf")
         for _ in range(ON_THE_WAY):  # a strong cause is far from off: as long as it gains much, it is not there yet
             if float(best.loss.mean()) > STILL_FALLING * before:
                 break
             before = float(best.loss.mean())
-            best = fit(fitted, trial.space, best.z, QUICK, most=trial.most)
+            best = fit(fitted, trial.space, best.z, QUICK, most=trial.most, slopes=False)
         return [best.z.tolist(), float(best.loss.mean())]
 
     size = len(screened.trial.space.knobs)
