@@ -20,7 +20,7 @@ from pred_core.plant.session import SessionConfig
 SESSION = SessionConfig(train=12, test=4, ood=3, seconds=4.0)
 SETS = ("final", "seen", "dev")
 REFERENCES = (50000, 51000, 52000, 53000)
-SEEN = (29, 106, 34, 64, 78)  # cases of each seen draw that were looked at
+SEEN = (29, 106, 34, 64, 78, 102)  # cases of each seen draw that were looked at
 LEAST, MOST = 2.0, 10.0  # magnitudes, in multiples of the effect's declared minimum, log-uniform
 
 
@@ -82,11 +82,11 @@ def release(which: str) -> Release:
     if which == "dev":
         return _release((7000,), cases(7100, 1, 8, 26, 7, 4))
     if which == "seen":
-        first = (50100, 2, 40), (50200, 3, 42), (50500, 4, 40), (50700, 5, 40), (51100, 6, 40)
+        first = (50100, 2, 40), (50200, 3, 42), (50500, 4, 40), (50700, 5, 40), (51100, 6, 40), (51400, 7, 40)
         drawn = [cases(begin, seed, controls, controls + 6, 10, 6) for begin, seed, controls in first]
         parts = [_release(REFERENCES, d[:count]) for d, count in zip(drawn, SEEN, strict=True)]
         return Release(parts[0].references, tuple(c for p in parts for c in p.cases))
-    return _release(REFERENCES, cases(51400, 7, 40, 46, 10, 6))
+    return _release(REFERENCES, cases(51600, 8, 40, 46, 10, 6))
 
 
 def simulate(root: Path, hidden: Hidden, seed: int) -> None:
