@@ -5,6 +5,7 @@ The answers take some 15 minutes of one core: `conftest.py` begins them with the
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import secrets
@@ -24,7 +25,8 @@ from pred_core.plant.hidden.library import LIBRARY as HIDDEN
 from pred_core.plant.rope_case import write_rope_case
 from pred_core.plant.session import SessionConfig
 
-SESSION = SessionConfig(train=12, test=4, ood=0, seconds=4.0)
+SESSION = SessionConfig(train=12, test=4, ood=0, seconds=4.0)  # of the reference and of the drawn case
+SHORT = dataclasses.replace(SESSION, train=8)  # of the fixed ones
 REFERENCE = 7000
 LIMIT = 900  # [s] for a command
 SECONDS = {1: 60, 2: 800}  # [s] for a diagnosis of so many causes: where one is hidden, none is looked for beside it
@@ -40,6 +42,7 @@ class Case:
     seed: int
     hidden: Hidden
     right: tuple[str, ...]
+    session: SessionConfig = SHORT
 
 
 SINGLES = (
@@ -47,7 +50,6 @@ SINGLES = (
     Case("friction", 7206, (("friction_scale", 1.2),), ("friction_scale",)),
     Case("table", 7210, (("table_height", 0.018),), ("table_height",)),
     Case("mass", 7241, (("mass_gradient", 1.9),), ("mass_gradient",)),
-    Case("gravity", 7203, (("gravity_tilt", 5.0),), ("gravity_offset",)),
     Case("slip", 7240, (("gripper_slip", 13.0),), ("grip_slip",)),
     Case("stiffness_drift", 7120, (("stiffness_drift", 2.6),), ("stiffness_drift",)),
     Case("delay", 7222, (("action_delay", 40.0),), ("delay",)),
@@ -70,7 +72,7 @@ def drawn() -> Case:
     rng = np.random.default_rng(seed)
     name = str(rng.choice(sorted(DRAWN)))
     magnitude = min(HIDDEN[name].minimum * float(rng.uniform(6.0, 10.0)), HIDDEN[name].high)
-    return Case(f"drawn (PRED_HIDDEN_SEED={seed} repeats it)", 100_000 + seed, ((name, magnitude),), ())
+    return Case(f"drawn (PRED_HIDDEN_SEED={seed} repeats it)", 100_000 + seed, ((name, magnitude),), (), SESSION)
 
 
 class Answers:
@@ -114,7 +116,7 @@ class Answers:
 
     def _identified(self) -> tuple[Path, Path]:
         data, twin = self.root / "reference", self.root / "twin"
-        self._simulate(data, (), REFERENCE)
+        self._simulate(data, (), REFERENCE, SESSION)
         self._pred("identify", data, "--out", twin, "--parameters",
                    "stiffness,damping,ground_friction,bending_stiffness", "--effects", "bending_damping",
                    "--restarts", "2")  # fmt: skip
@@ -123,15 +125,15 @@ class Answers:
     def _diagnose(self, case: Case) -> dict:  # type: ignore[type-arg]
         data = self.root / case.name.split()[0]
         out = data.with_name(f"{data.name}.out")
-        self._simulate(data, case.hidden, case.seed)
+        self._simulate(data, case.hidden, case.seed, case.session)
         reference, twin = self._reference.result()
         limit = SECONDS[max(len(case.hidden), 1)]
         self._pred("diagnose", data, "--twin", twin, "--reference", reference, "--out", out, "--seconds", limit)
         return dict(json.loads((out / "diagnosis.json").read_text()))
 
-    def _simulate(self, root: Path, hidden: Hidden, seed: int) -> None:
+    def _simulate(self, root: Path, hidden: Hidden, seed: int, session: SessionConfig) -> None:
         # In a process of its own: a hidden world and what judges it share nothing but the bags.
-        code = f"from pathlib import Path; from {__name__} import write; write(Path({str(root)!r}), {hidden!r}, {seed})"
+        code = f"import {__name__} as w; w.write({str(root)!r}, {hidden!r}, {seed}, {session.train})"
         self._run((sys.executable, "-c", code), Path(__file__).parent)
 
     def _pred(self, *words: object) -> None:
@@ -151,6 +153,6 @@ class Answers:
         assert process.returncode == 0, complaint[-2000:]
 
 
-def write(root: Path, hidden: Hidden, seed: int) -> None:
+def write(root: str, hidden: Hidden, seed: int, train: int) -> None:
     """One data set of the hidden world."""
-    write_rope_case(root, hidden, seed, lambda *_: None, session=SESSION)
+    write_rope_case(Path(root), hidden, seed, lambda *_: None, session=dataclasses.replace(SESSION, train=train))
