@@ -36,6 +36,7 @@ import os, signal, sys
 from pred_core.cli.main import main
 from pred_core.identify.journal import Journal
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs are started without
 evaluate, calls = Journal.evaluate, []
 
 def evaluated(self, *args):
