@@ -60,6 +60,26 @@ def test_wind_carries_what_falls() -> None:
     assert after.velocity[0].tolist() == pytest.approx([3.0, -1.0, -2.0], rel=1e-4)
 
 
+def test_wind_pushes_a_line_across_itself() -> None:
+    """A straight line along (cos a, sin a) in a wind of 4 m/s along x, in one step of 0.01 s with b = 0.5 1/m: across
+    itself by b (w sin a)^2, along itself not at all. With a share of one it is pushed as loose particles are, by b w^2
+    along x. Both with and without bending stiffness, one world and five.
+    """
+    angle = math.radians(30.0)
+    axis, across = np.array([math.cos(angle), math.sin(angle), 0.0]), np.array([math.sin(angle), -math.cos(angle), 0.0])
+    body = dataclasses.replace(line(7, 0.6), rest_position=np.linspace(0.0, 0.6, 7)[:, None] * axis)
+    wanted = {0.0: 0.01 * 0.5 * (4.0 * math.sin(angle)) ** 2 * across, 1.0: np.array([0.01 * 0.5 * 16.0, 0.0, 0.0])}
+    for share, change in wanted.items():
+        for stiffness in (0.0, 1e-4):
+            for worlds in (1, 5):
+                blow = one("wind", coefficient=0.5, velocity=(4.0, 0.0), along=share)
+                physics = Physics(stiffness=1.0, bending_stiffness=stiffness)
+                sim = SpringMass(body, physics, NOWHERE, extensions=blow, substeps=1)
+                state = sim.start(state_of(np.stack([body.rest_position] * worlds)))
+                _, after = sim.rollout_states(state, nobody(1))
+                assert np.allclose(after.velocity.numpy(), change, atol=1e-6), (share, stiffness, worlds)
+
+
 def test_attraction_is_strongest_at_its_range() -> None:
     # In one step of 0.01 s: a at d = r, and 2 exp(1/2 - 2) a = 0.44626 a at d = 2 r.
     push = one("attraction", strength=2.0, center=(0.1, 0.2, 0.3), range=0.2)
@@ -204,7 +224,10 @@ def test_springs_pull_as_their_law_says(id: str, values: dict[str, float], tensi
 Values = dict[str, tuple[float, ...]]
 # What is hidden, and where the search begins: amounts that matter, places seen from afar.
 PLANTED: dict[str, tuple[Values, Values]] = {
-    "wind": ({"coefficient": (0.3,), "velocity": (3.0, -2.0)}, {"coefficient": (0.1,), "velocity": (1.0, -1.0)}),
+    "wind": (
+        {"coefficient": (0.3,), "velocity": (3.0, -2.0), "along": (0.4,)},
+        {"coefficient": (0.1,), "velocity": (1.0, -1.0), "along": (0.1,)},
+    ),
     "attraction": (
         {"strength": (2.0,), "center": (0.2, 0.15, -0.3), "range": (0.12,)},
         {"strength": (0.5,), "center": (0.1, 0.1, -0.2), "range": (0.15,)},

@@ -49,6 +49,7 @@ class ParticleContext:
     mass: Any  # [kg]
     arc: Any  # material coordinate 0..1
     time: Any  # [s] of the session: since the start, later by what `State.memory['time']` was set to
+    tangent: Vec3 = Vec3(0.0, 0.0, 0.0)  # unit vector along a line, for effects that read it; 0 on sheets and volumes
 
 
 @dataclass(frozen=True)
@@ -141,6 +142,7 @@ class Effect:
     bend_memory: ClassVar[int] = 0  # values a `bend` hook keeps per bend
     line_values: ClassVar[int] = 0  # values a `bend` hook hands on along a line, from bend to bend
     grip_memory: ClassVar[int] = 0  # values a `boundary` hook keeps per held particle, moved on by `slide`
+    reads_tangent: ClassVar[bool] = False  # its `force` hook reads `ParticleContext.tangent`
     end_twist: ClassVar[str] = ""  # the parameter [rad] by which a line's far material axes are turned in its gripper
 
     @classmethod

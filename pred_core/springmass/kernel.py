@@ -79,6 +79,7 @@ class Worlds:
     frame_grip: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     memory: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     load: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
+    tangent: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     time: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     steps: wp.array(dtype=wp.float32)  # type: ignore[valid-type]
     clock: wp.array(dtype=wp.int32)  # type: ignore[valid-type]
@@ -99,9 +100,10 @@ def kernel_text(effects: tuple[type[Effect], ...], lanes: int, staged: bool) -> 
     """The C++ of the native function, every placeholder filled."""
     framed = any("bend" in e.hooks for e in effects)
     grips = sum(e.grip_memory for e in effects)
+    tangents = any(e.reads_tangent for e in effects)
     eight = stride(lanes, staged) == 4
     text = "\n".join(
-        (source.PRELUDE, source_bending.FRAME if framed else "", source.SPRING, source.SPRING_EIGHT if eight else "",
+        (source.PRELUDE, source_bending.TANGENT_BUFFER if tangents else "", source_bending.FRAME if framed else "", source.SPRING, source.SPRING_EIGHT if eight else "",
          source_bending.BEND, source_contact.CONTACT, source_contact.SELF_COLLISION,
          source_contact.GRIP_MEMORY if grips else "", source_contact.PARTICLE, source_contact.HELD,
          source.STAGED if staged else source.FUSED)
@@ -115,6 +117,7 @@ def kernel_text(effects: tuple[type[Effect], ...], lanes: int, staged: bool) -> 
         "@ALL_SPRINGS@": source.ALL_SPRINGS_EIGHT if eight else source.ALL_SPRINGS,
         "@ALL_BENDS@": source_bending.ALL_BENDS_FRAMED if framed else source_bending.ALL_BENDS,
         "@ONE_BEND@": source_bending.ONE_BEND_FRAMED if framed else source_bending.ONE_BEND,
+        "@TANGENT@": source_bending.TANGENT if tangents else "",
         "@BEND_FRAME@": source_bending.BEND_FRAME if framed else "",
         "@BEND_MOMENT@": source_bending.BEND_MOMENT if framed else "",
         "@END_TWIST@": end_twist(effects),

@@ -16,6 +16,7 @@ from pred_core.effects.effect import (
     SpringContext,
 )
 
+NO_TANGENT = Vec3(0.0, 0.0, 0.0)
 BASE_PARAMETERS = 4  # stiffness, damping, friction, bending_stiffness: a world's parameter row begins with them
 
 
@@ -76,6 +77,7 @@ def _force(code: Code, p: dict[str, Any], effect: type[Effect]) -> list[str]:
         mass=_value(code, "m_i"),
         arc=_value(code, "Lane(e[1])"),
         time=_value(code, "time"),
+        tangent=_vector(code, *(f"tangents[3 * i + {k}]" for k in range(3))) if effect.reads_tangent else NO_TANGENT,
     )
     f = effect.force(p, at)
     return [f"f{k} += {lane_text(v)};" for k, v in zip("xyz", (f.x, f.y, f.z), strict=True)]

@@ -20,7 +20,7 @@ from pred_core.springmass import grasp
 from pred_core.springmass.arrays import bend_rows, chains, mass_of_worlds
 from pred_core.springmass.collision import candidate_pairs, connected_within
 from pred_core.springmass.parameters import effects_of, extensions_per_world
-from pred_core.springmass.reference_bending import BendMemory, bend_forces
+from pred_core.springmass.reference_bending import BendMemory, bend_forces, line_tangents
 from pred_core.springmass.source_contact import WAY_OUT
 from pred_core.twin import Extension
 from pred_core.types import Body, Box, Fixture, Grip, Physics, Scene, Sphere, State
@@ -148,7 +148,7 @@ class Reference:
         scene, radius = self.scene, self.body.radius
         place, speed = Vec3.of(x), Vec3.of(v)
         for effect, p in self.hooks("force"):
-            f = effect.force(p, ParticleContext(place, speed, self.mass, self.arc, time))
+            f = effect.force(p, ParticleContext(place, speed, self.mass, self.arc, time, Vec3.of(line_tangents(self, x))))
             force = force + torch.stack([torch.as_tensor(c) + torch.zeros_like(x[..., 0]) for c in (f.x, f.y, f.z)], -1)
         gravity = torch.tensor(scene.gravity, dtype=torch.float64)
         load = force + self.mass[..., None] * gravity

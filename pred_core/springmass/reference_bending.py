@@ -54,6 +54,18 @@ def bend_forces(
     return force.index_add(1, i, along_a).index_add(1, j, along_b - along_a).index_add(1, k, -along_b)
 
 
+def line_tangents(sim: Reference, x: Tensor) -> Tensor:
+    """(W, N, 3) unit vectors along the lines: along the mean of a particle's two edges; 0 where no line is."""
+    tangent = torch.zeros_like(x)
+    for begin, end in sim.lines:
+        i, j, k = torch.as_tensor(sim.body.bends[begin:end], dtype=torch.long).T
+        a, b = x[:, j] - x[:, i], x[:, k] - x[:, j]
+        a, b = a / a.norm(dim=-1, keepdim=True), b / b.norm(dim=-1, keepdim=True)
+        tangent[:, i[0]], tangent[:, k[-1]] = a[:, 0], b[:, -1]
+        tangent[:, j] = (a + b) / (a + b).norm(dim=-1, keepdim=True)
+    return tangent
+
+
 def _moments(
     sim: Reference, x: Tensor, held: Tensor, rotation: Tensor, time: Tensor, h: float, memory: BendMemory, a: Tensor,
     b: Tensor, q: Tensor, weight: Tensor,

@@ -82,7 +82,8 @@ class SpringMass:
         self._twists = slice(0, 4 * len(self._lines) if framed else 0, 4)
         self._grip_size = body.count * sum(e.grip_memory for e in self.effects)  # at the end: per slot and particle
         self._memory_size = frame_size + self._grip_size
-        self._bends = len(body.bends) if framed or any(p.bending_stiffness != 0.0 for p in self.physics) else 0
+        seen = framed or any(e.reads_tangent for e in self.effects)
+        self._bends = len(body.bends) if seen or any(p.bending_stiffness != 0.0 for p in self.physics) else 0
         self._constants: dict[tuple[int, int], dict[str, Tensor]] = {}
         self._workspaces: dict[Size, tuple[Workspace, Tensor, Tensor]] = {}
 

@@ -12,6 +12,7 @@ BEND = r"""
     const Lane inverse_b = one / lane_sqrt(bx * bx + by * by + bz * bz + tiny);
     ax *= inverse_a; ay *= inverse_a; az *= inverse_a;
     bx *= inverse_b; by *= inverse_b; bz *= inverse_b;
+    @TANGENT@
     const Lane c = ax * bx + ay * by + az * bz;
     // A fold beyond 178 degrees has no finite curvature: the force is bounded there.
     const Lane q = one / lane_max(one + c, Lane(3e-4f));
@@ -183,6 +184,21 @@ BEND_FRAME = r"""
     const Lane change2 = lane_select(fresh > zero, zero, k2 - last[1]);
     last[0] = k1; last[1] = k2;
     Lane moment1 = zero, moment2 = zero;
+"""
+
+# Directions of a line at its particles, where `force` laws read them: along the mean of the two edges, at an end along
+# its edge. What is in no bend keeps zero.
+TANGENT_BUFFER = "Lane* tangents = (Lane*)w.tangent.data + (size_t)block * N * 3;"
+TANGENT = r"""
+    {
+      Lane sx = ax + bx, sy = ay + by, sz = az + bz;
+      const Lane inverse = one / lane_sqrt(sx * sx + sy * sy + sz * sz + tiny);
+      tangents[3 * j] = sx * inverse; tangents[3 * j + 1] = sy * inverse; tangents[3 * j + 2] = sz * inverse;
+      if (b == 0 || bends[3 * b - 2] != i) { tangents[3 * i] = ax; tangents[3 * i + 1] = ay; tangents[3 * i + 2] = az; }
+      if (b + 1 == B || bends[3 * b + 3] != j) {
+        tangents[3 * k] = bx; tangents[3 * k + 1] = by; tangents[3 * k + 2] = bz;
+      }
+    }
 """
 
 # Forces of the moments: the gradient of kb.M with M = moment1 d1 + moment2 d2 held fixed.

@@ -32,6 +32,7 @@ class Workspace:
     ):  # fmt: skip
         particles, memory, lines = body
         loads = particles if any(e.grip_memory for e in effects) else 0
+        tangents = particles if any(e.reads_tangent for e in effects) else 0
         self.framed = any("bend" in e.hooks for e in effects)
         blocks = -(-size.worlds // lanes)
         self.lanes, self.staged, self.device, self.model = lanes, staged, device, model
@@ -47,6 +48,7 @@ class Workspace:
             "frame_grip": (blocks, lines, 2, lanes),
             "memory": (blocks, memory, lanes),
             "load": (blocks, loads, 3, lanes),
+            "tangent": (blocks, tangents, 3, lanes),
             "time": (blocks, lanes),
             "steps": (blocks, lanes),
             "trajectory_out": (size.periods, blocks * lanes, particles, 3),
