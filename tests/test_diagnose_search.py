@@ -51,6 +51,24 @@ def test_a_reference_that_was_never_there_says_nothing_of_a_place() -> None:
     assert null_of(bench, screened, found) == pytest.approx(off)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_search_for_a_large_ball_begins_at_it(seed: int) -> None:
+    """Its centre is 16 cm from where the rope ever was, and a ball that does not reach the rope has no slope. The best
+    start explains most of what the true ball does, and stands within its radius of it.
+    """
+    twin, (radius, center) = rope(), (0.13, (0.17, 0.02, 0.5))
+    ball = find_effect("obstacle").extension(radius=radius, center=center)
+    suspect = recorded(twin, (ball,), SPLITS, seed=0, frames=40)
+    bench = bench_of(twin, suspect, recorded(twin, (), SPLITS, seed=100, frames=40))
+    trial = make_trial(bench.twin, (find_effect("obstacle"),))
+    begin = starts(bench.fitted, trial, 16, np.random.default_rng(seed))[0]
+    true = coordinates(trial.space, Candidate(bench.twin.physics, (ball,)))
+    off, there = bench.fitted.losses(trial.space, [trial.space.start(), true]).mean(axis=1)
+    assert begin.promise > 0.5 * (off - there) > 0.05
+    found = {e.id: e.parameters for e in trial.space.candidate(begin.z).extensions}["obstacle"]
+    assert math.dist(found["center"], center) < radius
+
+
 def stretched(stiffness: float) -> Twin:
     """The rope with other springs [N]; identified ones are as stiff as the substeps allowed, real ones stiffer."""
     twin = rope()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from pred_core.diagnose.fit import Target, rho
-from pred_core.diagnose.trial import Trial, first_values, scanned
+from pred_core.diagnose.trial import Trial, first_values, scanned, solid_values, switch
 from pred_core.effects import find_effect
 from pred_core.identify.space import Candidate, SearchSpace
 from pred_core.twin import Extension
@@ -19,6 +20,8 @@ SECANT = 0.7  # typical changes of the switch, over which a first slope is taken
 AHEAD = (1.5, 3.0, 6.0, 10.0)  # [typical changes] how far a start is followed along its direction
 DECIDED = 1.5  # times what the start promises: then the search begins ahead of it only
 NOWHERE = 1e-6  # [typical changes] length of a start that has no direction
+ABOUT = (1.0, 0.7, 0.5, 0.35, 0.25)  # [typical changes] spread of places that are tried about the best ones so far
+PARENTS = 4  # of these
 SCANNED = 16  # windows in which places are tried, those with the largest loss: one block of worlds
 
 
@@ -46,19 +49,13 @@ def starts(target: Target, trial: Trial, count: int, rng: np.random.Generator) -
         target, now = target.some(worst.numpy()), now[:, worst]
     else:
         share = 1.0
+    solid: list[Array] = []
     if scanning:
-        size = (now[0] / target.weights[..., None].clamp_min(1e-9)).square().sum(-1).sqrt().numpy()
-        origins = []
+        push = -(now[0] / target.weights[..., None].clamp_min(1e-9)).numpy()
+        size = np.linalg.norm(push, axis=-1)
         drawn = [first_values(e, target.roller, size, count, rng) for e in scanning]
-        for row in zip(*drawn, strict=True):
-            values = {e.id: e for e in row}
-            extensions = tuple(
-                dataclasses.replace(e, parameters={**e.parameters, **_scanned_values(values[e.id])})
-                if e.id in values
-                else e
-                for e in space.extensions
-            )
-            origins.append(coordinates(space, Candidate(space.physics, extensions)))
+        origins = [_at(space, row) for row in zip(*drawn, strict=True)]
+        solid = [_at(space, (v,), True) for e in scanning for v in solid_values(e, target.roller, push, count, rng)]
     upper = np.array(space.bounds()[1])
     lower = np.array(space.bounds()[0])
     points = []
@@ -84,6 +81,7 @@ def starts(target: Target, trial: Trial, count: int, rng: np.random.Generator) -
         if scanning and not np.abs(actual).max() > 1e-6:
             continue
         found.append(Start(z, promise))
+    found += _standing(target, space, null, solid, share, rng)
     found.sort(key=lambda s: -s.promise)
     ahead = _along(target, trial, found[0], share) if found else None
     if ahead is not None:
@@ -125,9 +123,38 @@ def _along(target: Target, trial: Trial, start: Start, share: float) -> Start | 
     return Start(best, max(share * float(before - after), 0.0))
 
 
-def _scanned_values(extension: Extension) -> dict[str, tuple[float, ...]]:
-    effect = find_effect(extension.id)
-    return {q.name: extension.parameters[q.name] for q in scanned(effect)}
+def _standing(
+    target: Target, space: SearchSpace, null: Array, points: list[Array], share: float, rng: np.random.Generator
+) -> list[Start]:
+    """Points that save something, as they are, and better ones about the best of them: what is solid has no slope
+    that would say where else it might stand.
+    """
+    if not points:
+        return []
+    lower, upper = (np.array(b) for b in space.bounds())
+    before = float(target.losses(space, [null]).mean())
+    tried: list[tuple[float, Array]] = []
+    for spread in (*ABOUT, 0.0):
+        losses = target.losses(space, points).mean(axis=1).tolist()
+        tried = sorted([*tried, *zip(losses, points, strict=True)], key=lambda t: t[0])
+        best = [z for _, z in tried[:PARENTS]]
+        points = [
+            np.clip(best[n % len(best)] + rng.normal(0.0, spread, len(null)), lower, upper) for n in range(len(points))
+        ]
+    return [Start(z, share * (before - loss)) for loss, z in tried if loss < before]
+
+
+def _at(space: SearchSpace, values: Sequence[Extension], switched: bool = False) -> Array:
+    """Coordinates with the scanned parameters of these values, and with their switches where they are on."""
+    given = {}
+    for extension in values:
+        effect = find_effect(extension.id)
+        names = [q.name for q in scanned(effect)] + ([switch(effect).name] if switched else [])
+        given[extension.id] = {name: extension.parameters[name] for name in names}
+    extensions = tuple(
+        dataclasses.replace(e, parameters={**e.parameters, **given.get(e.id, {})}) for e in space.extensions
+    )
+    return coordinates(space, Candidate(space.physics, extensions))
 
 
 def coordinates(space: SearchSpace, candidate: Candidate) -> Array:

@@ -15,6 +15,9 @@ from pred_core.types import Array
 
 # Effects that are measurement (corrected, not simulated) or too flexible to be a name: they would explain anything.
 NOT_A_NAME = ("bending_profile", "mass_profile", "rest_curvature")
+SOLID = "solid"
+DEEP = (0.02, 0.2)  # [m] of the centre of something solid behind where it seems to push
+ASKEW = 0.3  # by how much its direction is drawn off that of the push
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ def first_values(
         place = target[int(rng.choice(len(target), p=weight))] + rng.normal(0.0, 0.06, 3)
         values: dict[str, tuple[float, ...]] = {}
         for q in scanned(effect):
-            if q.scan == "place":
+            if q.scan in ("place", SOLID):
                 value = tuple(place.tolist())
             elif q.scan == "floor":
                 value = tuple(place[:2].tolist())
@@ -100,5 +103,30 @@ def first_values(
                 angle = 2.0 * np.pi * n / count
                 value = (q.typical * float(np.cos(angle)), q.typical * float(np.sin(angle)))
             values[q.name] = tuple(float(np.clip(v, q.low, q.high)) for v in value)
+        result.append(effect.extension(**values))
+    return result
+
+
+def solid_values(
+    effect: type[Effect], roller: Roller, push: Array, count: int, rng: np.random.Generator
+) -> list[Extension]:
+    """Extensions of something solid whose surface is where the object was measured, none for other effects.
+
+    `push` (W, K, N, 3) [m]: from where the object was predicted to where it was measured. Drawn where that is large.
+    """
+    solid = next((q for q in scanned(effect) if q.scan == SOLID), None)
+    vector = push.reshape(-1, 3)
+    size = np.linalg.norm(vector, axis=1)
+    if solid is None or not size.any():
+        return []
+    w = roller.sample.windows
+    stride = max(1, len(w.target) // push.shape[1])
+    target = w.target[stride - 1 :: stride].movedim(0, 1)[:, : push.shape[1]].reshape(-1, 3).numpy()
+    result = []
+    for row in rng.choice(len(size), count, p=size**2 / (size**2).sum()):
+        away = vector[row] / size[row] + rng.normal(0.0, ASKEW, 3)
+        depth = float(np.exp(rng.uniform(*np.log(DEEP))))
+        place = target[row] - depth * away / np.linalg.norm(away)
+        values: dict[str, float | tuple[float, ...]] = {switch(effect).name: depth, solid.name: tuple(place.tolist())}
         result.append(effect.extension(**values))
     return result

@@ -35,8 +35,8 @@ class Parameter:
     starts: tuple[float, ...] = ()  # refined, not searched globally: where a refinement starts, and what else it tries
     doc: str = ""
     # It matters only with another parameter on, and has many optima: values that a diagnosis tries first come from
-    # "place": where the object was (world); "floor": the same, x and y; "arc": along the object; "direction": all
-    # round.
+    # "place": where the object was (world); "solid": the same, and behind where something seems to push, the switch, a
+    # radius [m], as large as that is deep; "floor": a place's x and y; "arc": along the object; "direction": all round.
     scan: str = ""
 
 

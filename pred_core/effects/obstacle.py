@@ -25,7 +25,7 @@ class Obstacle(Effect):
     hooks = ("force",)
     parameters = (
         Parameter("radius", "m", 0.0, 0.5, typical=0.03, doc="of the ball, the object's own radius included"),
-        Parameter("center", "m", -5.0, 5.0, size=3, typical=0.1, scan="place", doc="in world"),
+        Parameter("center", "m", -5.0, 5.0, size=3, typical=0.1, scan="solid", doc="in world"),
         Parameter("friction", "1", 0.0, 3.0, null=0.5, typical=0.3, doc="mu, coefficient of the object on the ball"),
     )
     confounded_with = ("attraction", "friction_patch", "table_height")

@@ -103,10 +103,10 @@ def kernel_text(effects: tuple[type[Effect], ...], lanes: int, staged: bool) -> 
     tangents = any(e.reads_tangent for e in effects)
     eight = stride(lanes, staged) == 4
     text = "\n".join(
-        (source.PRELUDE, source_bending.TANGENT_BUFFER if tangents else "", source_bending.FRAME if framed else "", source.SPRING, source.SPRING_EIGHT if eight else "",
-         source_bending.BEND, source_contact.CONTACT, source_contact.SELF_COLLISION,
-         source_contact.GRIP_MEMORY if grips else "", source_contact.PARTICLE, source_contact.HELD,
-         source.STAGED if staged else source.FUSED)
+        (source.PRELUDE, source_bending.TANGENT_BUFFER if tangents else "", source_bending.FRAME if framed else "",
+         source.SPRING, source.SPRING_EIGHT if eight else "", source_bending.BEND, source_contact.CONTACT,
+         source_contact.SELF_COLLISION, source_contact.GRIP_MEMORY if grips else "", source_contact.PARTICLE,
+         source_contact.HELD, source.STAGED if staged else source.FUSED)
     )  # fmt: skip
     parts = {
         "@SPRING_LAW@": source.SPRING_LAW,

@@ -146,9 +146,9 @@ class Reference:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Semi-implicit Euler with contact: pusher, fixtures, ground. (x, v, all forces but contact)."""
         scene, radius = self.scene, self.body.radius
-        place, speed = Vec3.of(x), Vec3.of(v)
+        place, speed, tangent = Vec3.of(x), Vec3.of(v), Vec3.of(line_tangents(self, x))
         for effect, p in self.hooks("force"):
-            f = effect.force(p, ParticleContext(place, speed, self.mass, self.arc, time, Vec3.of(line_tangents(self, x))))
+            f = effect.force(p, ParticleContext(place, speed, self.mass, self.arc, time, tangent))
             force = force + torch.stack([torch.as_tensor(c) + torch.zeros_like(x[..., 0]) for c in (f.x, f.y, f.z)], -1)
         gravity = torch.tensor(scene.gravity, dtype=torch.float64)
         load = force + self.mass[..., None] * gravity
