@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pred_core.diagnose.places import first_values
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.structure import FAMILY, ID, applies
-from pred_core.diagnose.trial import NOT_A_NAME, first_values, scanned, switch
+from pred_core.diagnose.trial import NOT_A_NAME, scanned, switch
 from pred_core.effects import LIBRARY
 from pred_core.effects.effect import Effect, Parameter
 from pred_core.identify.space import Candidate

@@ -15,7 +15,8 @@ from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import ACTS, Judged
 from pred_core.diagnose.fit import IN_FULL, USUAL, Target, fit, graduated, rho, without_groups
 from pred_core.diagnose.journal import Journal, vector
-from pred_core.diagnose.search import Start, starts
+from pred_core.diagnose.places import Start
+from pred_core.diagnose.search import starts
 from pred_core.diagnose.trial import Trial, make_trial, scanned
 from pred_core.effects.effect import Effect
 from pred_core.twin import Twin

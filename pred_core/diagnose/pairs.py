@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pred_core.diagnose.evidence import Judged, family_wise
 from pred_core.diagnose.judge import Effects, Screened, Tell, judge
 from pred_core.diagnose.naming import LEFT, share_closed, why_not
+from pred_core.diagnose.places import Start
 from pred_core.diagnose.progress import Named, Progress
-from pred_core.diagnose.search import Start
 from pred_core.types import Array
 
 PAIRED = 5  # candidates whose pairs are tried

@@ -13,9 +13,9 @@ from pred_core.diagnose.fit import IN_FULL, counted
 from pred_core.diagnose.judge import QUICK, Bench, Effects, Screened, Tell, judge, quick, rng_of, scaled, screen
 from pred_core.diagnose.naming import FEWEST, LEFT, STANDING, choose
 from pred_core.diagnose.pairs import try_pairs
+from pred_core.diagnose.places import Start
 from pred_core.diagnose.progress import Progress, Round
 from pred_core.diagnose.roll import on_ground
-from pred_core.diagnose.search import Start
 from pred_core.diagnose.skill import POOR, skill_of
 from pred_core.diagnose.trial import NOT_A_NAME, make_trial
 from pred_core.effects import LIBRARY

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from pred_core.diagnose.fit import Target, rho
-from pred_core.diagnose.trial import Trial, first_values, scanned, solid_values, switch
+from pred_core.diagnose.places import Start, first_values, gathered, solid_values
+from pred_core.diagnose.trial import Trial, scanned, switch
 from pred_core.effects import find_effect
 from pred_core.identify.space import Candidate, SearchSpace
 from pred_core.twin import Extension
@@ -20,17 +20,7 @@ SECANT = 0.7  # typical changes of the switch, over which a first slope is taken
 AHEAD = (1.5, 3.0, 6.0, 10.0)  # [typical changes] how far a start is followed along its direction
 DECIDED = 1.5  # times what the start promises: then the search begins ahead of it only
 NOWHERE = 1e-6  # [typical changes] length of a start that has no direction
-ABOUT = (1.0, 0.7, 0.5, 0.35, 0.25)  # [typical changes] spread of places that are tried about the best ones so far
-PARENTS = 4  # of these
 SCANNED = 16  # windows in which places are tried, those with the largest loss: one block of worlds
-
-
-@dataclass(frozen=True)
-class Start:
-    """A place to refine from, and what a straight line promises there."""
-
-    z: Array
-    promise: float  # loss that the best step along the switches would save
 
 
 def starts(target: Target, trial: Trial, count: int, rng: np.random.Generator) -> list[Start]:
@@ -81,7 +71,9 @@ def starts(target: Target, trial: Trial, count: int, rng: np.random.Generator) -
         if scanning and not np.abs(actual).max() > 1e-6:
             continue
         found.append(Start(z, promise))
-    found += _standing(target, space, null, solid, share, rng)
+    if scanning:
+        places = [*solid, *(s.z for s in found)]
+        found = gathered(target, trial, places, share, rng)
     found.sort(key=lambda s: -s.promise)
     ahead = _along(target, trial, found[0], share) if found else None
     if ahead is not None:
@@ -121,27 +113,6 @@ def _along(target: Target, trial: Trial, start: Start, share: float) -> Start | 
         return None
     before, after = target.losses(space, [off, best]).mean(axis=1)
     return Start(best, max(share * float(before - after), 0.0))
-
-
-def _standing(
-    target: Target, space: SearchSpace, null: Array, points: list[Array], share: float, rng: np.random.Generator
-) -> list[Start]:
-    """Points that save something, as they are, and better ones about the best of them: what is solid has no slope
-    that would say where else it might stand.
-    """
-    if not points:
-        return []
-    lower, upper = (np.array(b) for b in space.bounds())
-    before = float(target.losses(space, [null]).mean())
-    tried: list[tuple[float, Array]] = []
-    for spread in (*ABOUT, 0.0):
-        losses = target.losses(space, points).mean(axis=1).tolist()
-        tried = sorted([*tried, *zip(losses, points, strict=True)], key=lambda t: t[0])
-        best = [z for _, z in tried[:PARENTS]]
-        points = [
-            np.clip(best[n % len(best)] + rng.normal(0.0, spread, len(null)), lower, upper) for n in range(len(points))
-        ]
-    return [Start(z, share * (before - loss)) for loss, z in tried if loss < before]
 
 
 def _at(space: SearchSpace, values: Sequence[Extension], switched: bool = False) -> Array:

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from pred_core.diagnose.roll import LOSS, MOST_FACTOR, MOST_LOSS, Roller
+from pred_core.diagnose.roll import LOSS, MOST_FACTOR, MOST_LOSS
 from pred_core.effects import find_effect
 from pred_core.effects.effect import Effect, Parameter
 from pred_core.identify.space import SearchSpace, search_space
-from pred_core.twin import Extension, Twin
-from pred_core.types import Array
+from pred_core.twin import Twin
 
 # Effects that are measurement (corrected, not simulated) or too flexible to be a name: they would explain anything.
 NOT_A_NAME = ("bending_profile", "mass_profile", "rest_curvature")
-SOLID = "solid"
-DEEP = (0.02, 0.2)  # [m] of the centre of something solid behind where it seems to push
-ASKEW = 0.3  # by how much its direction is drawn off that of the push
 
 
 @dataclass(frozen=True)
@@ -71,62 +65,3 @@ def scanned(effect: type[Effect]) -> tuple[Parameter, ...]:
 def _parameter(effect: type[Effect], knob: str) -> Parameter:
     name = knob.split(".", 1)[1].split("[", 1)[0]
     return next(q for q in effect.parameters if q.name == name)
-
-
-def first_values(
-    effect: type[Effect], roller: Roller, error: Array, count: int, rng: np.random.Generator
-) -> list[Extension]:
-    """Extensions with the switch at its null and the scanned parameters drawn; one, if nothing is scanned.
-
-    `error` (W, K, N): size of the residual. Places are drawn where the residual is large, between what was predicted
-    and what was measured, because there something acts.
-    """
-    if not scanned(effect):
-        return [effect.extension()]
-    weight = error.reshape(-1) ** 2
-    weight = weight / weight.sum() if weight.sum() > 0 else np.full(weight.size, 1.0 / weight.size)
-    w = roller.sample.windows
-    stride = max(1, len(w.target) // error.shape[1])
-    target = w.target[stride - 1 :: stride].movedim(0, 1)[:, : error.shape[1]].reshape(-1, 3).numpy()
-    result = []
-    for n in range(count):
-        place = target[int(rng.choice(len(target), p=weight))] + rng.normal(0.0, 0.06, 3)
-        values: dict[str, tuple[float, ...]] = {}
-        for q in scanned(effect):
-            if q.scan in ("place", SOLID):
-                value = tuple(place.tolist())
-            elif q.scan == "floor":
-                value = tuple(place[:2].tolist())
-            elif q.scan == "arc":
-                value = (float(rng.uniform(q.low, q.high)),)
-            else:  # direction
-                angle = 2.0 * np.pi * n / count
-                value = (q.typical * float(np.cos(angle)), q.typical * float(np.sin(angle)))
-            values[q.name] = tuple(float(np.clip(v, q.low, q.high)) for v in value)
-        result.append(effect.extension(**values))
-    return result
-
-
-def solid_values(
-    effect: type[Effect], roller: Roller, push: Array, count: int, rng: np.random.Generator
-) -> list[Extension]:
-    """Extensions of something solid whose surface is where the object was measured, none for other effects.
-
-    `push` (W, K, N, 3) [m]: from where the object was predicted to where it was measured. Drawn where that is large.
-    """
-    solid = next((q for q in scanned(effect) if q.scan == SOLID), None)
-    vector = push.reshape(-1, 3)
-    size = np.linalg.norm(vector, axis=1)
-    if solid is None or not size.any():
-        return []
-    w = roller.sample.windows
-    stride = max(1, len(w.target) // push.shape[1])
-    target = w.target[stride - 1 :: stride].movedim(0, 1)[:, : push.shape[1]].reshape(-1, 3).numpy()
-    result = []
-    for row in rng.choice(len(size), count, p=size**2 / (size**2).sum()):
-        away = vector[row] / size[row] + rng.normal(0.0, ASKEW, 3)
-        depth = float(np.exp(rng.uniform(*np.log(DEEP))))
-        place = target[row] - depth * away / np.linalg.norm(away)
-        values: dict[str, float | tuple[float, ...]] = {switch(effect).name: depth, solid.name: tuple(place.tolist())}
-        result.append(effect.extension(**values))
-    return result
