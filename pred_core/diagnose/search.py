@@ -20,6 +20,7 @@ SECANT = 0.7  # typical changes of the switch, over which a first slope is taken
 AHEAD = (1.5, 3.0, 6.0, 10.0)  # [typical changes] how far a start is followed along its direction
 DECIDED = 1.5  # times what the start promises: then the search begins ahead of it only
 NOWHERE = 1e-6  # [typical changes] length of a start that has no direction
+PROMISING = 8  # places of those drawn that are tried in earnest
 SCANNED = 16  # windows in which places are tried, those with the largest loss: one block of worlds
 
 
@@ -71,10 +72,9 @@ def starts(target: Target, trial: Trial, count: int, rng: np.random.Generator) -
         if scanning and not np.abs(actual).max() > 1e-6:
             continue
         found.append(Start(z, promise))
-    if scanning:
-        places = [*solid, *(s.z for s in found)]
-        found = gathered(target, trial, places, share, rng)
     found.sort(key=lambda s: -s.promise)
+    if scanning:
+        found = gathered(target, trial, [*solid, *(s.z for s in found[:PROMISING])], share, rng)
     ahead = _along(target, trial, found[0], share) if found else None
     if ahead is not None:
         decided = not scanning and ahead.promise > DECIDED * found[0].promise
