@@ -333,13 +333,14 @@ def everything(ids: list[str], amount: float = 1.0) -> tuple[Extension, ...]:
     return tuple(out)
 
 
-@pytest.mark.parametrize("worlds", [2, 5])  # one after the other, and in lanes
-def test_all_laws_together_equal_the_reference(worlds: int) -> None:
+# One after the other, in lanes, and in the stages of CUDA.
+@pytest.mark.parametrize(("worlds", "staged"), [(2, False), (5, False), (2, True)])
+def test_all_laws_together_equal_the_reference(worlds: int, staged: bool) -> None:
     body, scene = line(12, 0.55, radius=0.004), Scene(ground=-0.006)
     physics = [Physics(stiffness=60.0, damping=0.1, bending_stiffness=2e-4, ground_friction=0.1 * w)
                for w in range(1, worlds + 1)]  # fmt: skip
     extensions = [everything(list(PLANTED), 0.3 + 0.1 * w) for w in range(worlds)]
-    sim = SpringMass(body, physics, scene, extensions=extensions, substeps=20)
+    sim = SpringMass(body, physics, scene, extensions=extensions, substeps=20, staged=staged)
     twin = Reference(body, physics, scene, substeps=20, extensions=extensions)
     rng = np.random.default_rng(0)
     speed = rng.normal(size=(worlds, 12, 3)) * 0.3
