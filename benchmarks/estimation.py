@@ -23,6 +23,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
+from argument_types import amount, count
 from estimation_ensemble import Ensemble
 from estimation_worlds import FAULTS, Fault, World, make_tracks, make_worlds
 
@@ -168,10 +169,10 @@ def table(results: dict[str, Scores]) -> str:
 def main() -> None:
     """Simulate, follow, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--episodes", type=int, default=8)
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--seed", type=int, default=4100)
-    parser.add_argument("--ensemble", action="store_true", help="beside it, at four times its cost")
+    parser.add_argument("--episodes", type=count(1, 1000), default=8)
+    parser.add_argument("--seconds", type=amount(1.0, 600.0), default=5.0)
+    parser.add_argument("--seed", type=count(0), default=4100)
+    parser.add_argument("--ensemble", action="store_true", help="beside it, at three times its cost")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     torch.set_num_threads(1)

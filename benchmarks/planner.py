@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from argument_types import count
 from torch import Tensor
 
 from pred_core.dynamics import Dynamics
@@ -230,8 +231,8 @@ def replans(name: str, twin: Twin, samples: int, steps: int, device: str, rounds
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=15, help="at least 9")
-    parser.add_argument("--samples", type=int, default=64, help="motions an iteration")
+    parser.add_argument("--rounds", type=count(9, 1000), default=15, help="at least 9")
+    parser.add_argument("--samples", type=count(2), default=64, help="motions an iteration")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where motions are simulated")
     parser.add_argument("--twin", type=Path, help="a twin with a residual, in addition")
     args = parser.parse_args()

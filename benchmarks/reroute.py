@@ -10,7 +10,7 @@
         the table, scores.json and report.html
 
 A trial ends when the rope is through at two looks in a row (pred_core/plant/live/success.py), or when its time is up.
-Starts with seeds below 1000 are for development, the final ones begin at 5000.
+Starts with seeds below 1000 are for development, the final ones begin at 8000.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from argument_types import count
 from measured_cables import identify, pred
 from reroute_scores import write_scores
 from reroute_trial import TrialConfig, run_trial, write_whole
@@ -40,7 +41,7 @@ from pred_core.twin import Twin
 
 SETTINGS = Path(__file__).parents[1] / "config" / "plan" / "slot.yaml"
 TWINS = ("spring-mass", "pred")
-FIRST = 5000  # seed of the first final trial
+FIRST = 8000  # seed of the first final trial
 COLLECT = shlex.split("--episodes 10 3 0 --seconds 6 --mass 0.05 --radius 0.004 --seed 1")
 SEARCH = shlex.split("--restarts 2 --evaluations 300")
 EXTENDED = shlex.split("--parameters stiffness,damping,ground_friction,bending_stiffness --effects bending_damping")
@@ -68,13 +69,13 @@ def _arguments() -> argparse.Namespace:
     commands = parser.add_subparsers(dest="command", required=True)
     recipe = commands.add_parser("twin", help="record, identify and train both twins")
     recipe.set_defaults(act=make_twins)
-    recipe.add_argument("--cable", type=int, default=0, help="0: the nominal cable; else the seed of a drawn one")
+    recipe.add_argument("--cable", type=count(0), default=0, help="0: the nominal cable; else the seed of a drawn one")
     run = commands.add_parser("run", help="the trials")
     run.set_defaults(act=run_trials)
     run.add_argument("--twin", choices=TWINS, action="append", help="default: both")
-    run.add_argument("--trials", type=int, default=30)
-    run.add_argument("--first", type=int, default=FIRST, help=f"first seed; default: {FIRST}")
-    run.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="trials at once")
+    run.add_argument("--trials", type=count(1), default=30)
+    run.add_argument("--first", type=count(0), default=FIRST, help=f"first seed; default: {FIRST}")
+    run.add_argument("--jobs", type=count(1, 256), default=os.cpu_count() or 1, help="trials at once")
     run.add_argument("--settings", default=str(SETTINGS), help="of the planner")
     for field in dataclasses.fields(TrialConfig):
         kind = type(field.default)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from argument_types import amount, count
 from reroute import SETTINGS, TWINS
 from reroute_eyes import TrueEyes, held_of
 from reroute_trial import TrialConfig, run_trial
@@ -98,10 +99,10 @@ def main() -> int:
     torch.set_num_threads(1)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True, metavar="DIR", help="with the twins of reroute.py")
-    parser.add_argument("--first", type=int, default=1, help="first seed")
-    parser.add_argument("--trials", type=int, default=4, help="of each twin")
-    parser.add_argument("--cable", type=int, default=TrialConfig.cable)
-    parser.add_argument("--gap", type=float, default=TrialConfig.gap)
+    parser.add_argument("--first", type=count(0), default=1, help="first seed")
+    parser.add_argument("--trials", type=count(1), default=4, help="of each twin")
+    parser.add_argument("--cable", type=count(0), default=TrialConfig.cable)
+    parser.add_argument("--gap", type=amount(0.01, 0.1), default=TrialConfig.gap)
     args = parser.parse_args()
     config = TrialConfig(cable=args.cable, gap=args.gap)
     try:

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from argument_types import count
 from reroute import TWINS, about
 from reroute_cell import DrivenCell, go
 from reroute_eyes import TrueEyes
@@ -157,9 +158,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True, metavar="DIR", help="with the twins of reroute.py")
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
-    parser.add_argument("--trials", type=int, default=10)
-    parser.add_argument("--first", type=int, default=5000, help="first seed")
-    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--trials", type=count(1), default=10)
+    parser.add_argument("--first", type=count(0), default=5000, help="first seed")
+    parser.add_argument("--jobs", type=count(1, 256), default=1)
     parser.add_argument("--once", action="store_true", help="one plan a trial, carried out without another look")
     args = parser.parse_args()
     config = TrialConfig(limit=REST, replan=REST) if args.once else TrialConfig(limit=LIMIT)

@@ -21,6 +21,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from argument_types import amount, count
 from numpy.typing import NDArray
 from tracking_cloth import Cloth, OnCloth
 
@@ -213,8 +214,8 @@ SCENES = ("rope", "rope_covered", "rope_still", "cell", "cloth", "cloth_covered"
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
-    parser.add_argument("--seconds", type=float, default=6.0)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--seconds", type=amount(0.5, 600.0), default=6.0)
+    parser.add_argument("--seeds", type=count(0), nargs="+", default=[0])
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     results: dict[str, list[dict[str, float]]] = {}

@@ -24,6 +24,7 @@ from pred_ros.node_parameters import check_parameters
 from pred_ros.processes import NODES, Children, node_command, node_environment
 
 PARAMETERS = "ros__parameters"
+LAST_DOMAIN = 232  # beyond it the ports of DDS do not fit in 16 bits
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,6 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--logs", type=Path, help="folder for the nodes' output; default: a temporary one")
     args = parser.parse_args(argv)
     try:
+        if args.domain is not None and not 0 <= args.domain <= LAST_DOMAIN:
+            raise ConfigError("--domain", got=args.domain, allowed=f"0 to {LAST_DOMAIN}")
         nodes = read_nodes(args.file, args.overrides)
         check_parameters(nodes)
         return run(nodes, args.domain, args.logs)

@@ -110,13 +110,13 @@ class PlannerNode(Shell):
         self._state, self._goal, self._ending = None, None, False
         self._poses.clear()
         self._enabled, self._latched = config.enabled, False
-        self._worker = self._pool.submit(self._work)
         self._inputs = [
             self.create_subscription(PointCloud2, GOAL_POINTS, self._on_goal, qos.latched()),
             self.create_subscription(PoseArray, GRIPPER_POSE, self._on_pose, qos.poses_live()),
             self.create_subscription(PointCloud2, STATE_POINTS, self._on_state, qos.points_live()),
         ]
         self._watch = self.create_timer(0.05, lambda: self.check_worker(self._worker))
+        self._worker = self._pool.submit(self._work)  # last: what fails before leaves no thread behind
 
     def stop(self) -> None:
         """End the worker; what was sent is carried out to its stop."""
@@ -233,6 +233,7 @@ class PlannerNode(Shell):
                     if reset:
                         self._session.reset()
                     if goal is not None:
+                        self._session.clear_goal()  # also where the new one is refused
                         self._session.set_goal(planner_messages.cloud_to_goal(goal))
                     if state is not None and state[0] != last and self._session.has_goal:
                         last = state[0]

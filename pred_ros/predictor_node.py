@@ -151,9 +151,9 @@ class PredictorNode(Shell):
             self._predictor = Predictor(self._dynamics, self._ids, self._held, rules, self._twin.calibration)
         self._inbox = queue.SimpleQueue()
         self._stopping = False
-        self._worker = self._pool.submit(self._work)
         self._starter = self.create_timer(0.02, self._subscribe_when_heard)
         self._watch = self.create_timer(0.05, lambda: self.check_worker(self._worker))
+        self._worker = self._pool.submit(self._work)  # last: what fails before leaves no thread behind
 
     def stop(self) -> None:
         """End the worker; what waits in the inbox is not predicted any more."""

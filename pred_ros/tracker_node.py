@@ -7,6 +7,7 @@ with `prior` state/points. Out: tracker/points with the stamp of the newest pict
 from __future__ import annotations
 
 import functools
+import re
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -42,6 +43,7 @@ from pred_ros.shell import REFUSAL_SHOWN, Shell
 
 SILENT = 1.0  # [s] without a picture before a camera counts as dead
 WAITING = "waiting"
+PREFIX = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")  # of topics' names
 GAP, GAP_TIMES = 0.25, 2.5  # [s], usual times between pictures: a longer silence of all cameras is said afterwards
 
 
@@ -86,13 +88,14 @@ def core_config(config: TrackerNodeConfig) -> TrackerConfig:
 
 
 def parse_cameras(text: str) -> list[str]:
-    """'cam0, cam1' -> ['cam0', 'cam1']. Raises: ConfigError for none, too many or a repeated one."""
+    """'cam0, cam1' -> ['cam0', 'cam1']. Raises: ConfigError for none, too many, a repeated or an impossible one."""
     names = text.replace(",", " ").split()
-    if not 1 <= len(set(names)) == len(names) <= MOST_CAMERAS:
+    fine = all(PREFIX.fullmatch(name) for name in names)
+    if not fine or not 1 <= len(set(names)) == len(names) <= MOST_CAMERAS:
         raise ConfigError(
             "parameter 'cameras'",
             got=repr(text),
-            allowed=f"1 to {MOST_CAMERAS} different prefixes",
+            allowed=f"1 to {MOST_CAMERAS} different prefixes of topics: letters, digits, _ and /, no digit first",
             next_step="-p cameras:='cam0 cam1'",
         )
     return names
@@ -108,6 +111,10 @@ def parse_fixtures(text: str) -> tuple[Box, ...]:
             raise ConfigError(
                 "parameter 'fixtures'", got=repr(item), allowed="six numbers a box: x y z hx hy hz"
             ) from error
+        if not (np.isfinite((x, y, z)).all() and 0.0 < min(a, b, c) <= max(a, b, c) < np.inf):
+            raise ConfigError(
+                "parameter 'fixtures'", got=repr(item), allowed="a finite centre and half sizes above 0 [m]"
+            )
         boxes.append(Box((x, y, z), (a, b, c)))
     return tuple(boxes)
 
@@ -150,7 +157,6 @@ class TrackerNode(Shell):
         """Subscribe and start the worker."""
         self._pairs = CameraPairs(self._names, self.seconds)
         self._stopping, self._published, self._gripped, self._first = False, -1, False, None
-        self._worker = self._pool.submit(self._work)
         for name in self._names:
             for kind, topic in (("color", images.COLOR), ("depth", images.DEPTH)):
                 callback = functools.partial(self._on_image, name, kind)
@@ -166,6 +172,7 @@ class TrackerNode(Shell):
         if self.config.prior:
             self._listen(PointCloud2, STATE_POINTS, self._on_state, qos.points_live())
         self._watch = self.create_timer(0.05, lambda: self.check_worker(self._worker))
+        self._worker = self._pool.submit(self._work)  # last: what fails before leaves no thread behind
 
     def stop(self) -> None:
         """End the worker."""
@@ -195,6 +202,7 @@ class TrackerNode(Shell):
         if self._worker is None:
             return
         self.diagnostics.value("pictures dropped, newer came", str(self._pairs.dropped))
+        self.diagnostics.value("pictures that came too late", str(self._tracker.stale))
         silent = self._pairs.silent(SILENT)
         gap_age = self.diagnostics.age("last gap")
         if self.refusal:

@@ -89,6 +89,12 @@ def test_a_plan_must_begin_where_the_arm_will_be() -> None:
     with pytest.raises(InputError, match="60 mm, 0.00 rad away"):
         follower.accept(plan_of(), away, 0)
     follower.accept(plan_of(first=0.1), away, 0)  # 0.1 s at 0.25 m/s more: within 75 mm
+    with pytest.raises(InputError, match="200 mm, 0.00 rad away.*allowed: 81 mm"):  # it stops within 0.125 s
+        follower = Follower(CONFIG, lifetime=3.0)
+        follower.accept(plan_of(first=1.0), (np.array(HOME) + (0.0, 0.2, 0.0), DOWN), 0)
+    with pytest.raises(InputError, match="too far ahead; got 3.100 s; allowed: 3 s"):
+        follower.accept(plan_of(first=3.1), HERE, 0)
+    follower.accept(plan_of(first=2.9), HERE, 0)
     with pytest.raises(InputError, match="lies in the past; got it ended 0.100 s ago"):
         follower.accept(plan_of(), HERE, 1_300_000_000)
     with pytest.raises(InputError, match="too old; got 3.500 s"):

@@ -26,8 +26,8 @@ from pred_core.twin import Twin, TwinMeta
 from pred_core.types import ObjectInfo, Physics, Scene
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
-MODULES = ("hidden_scores", "measured_cables", "reroute_cell", "reroute_eyes", "reroute_trial", "reroute_figures",
-           "reroute_scores", "reroute", "reroute_foresight", "rope_tasks")  # fmt: skip
+MODULES = ("argument_types", "hidden_scores", "measured_cables", "reroute_cell", "reroute_eyes", "reroute_trial",
+           "reroute_figures", "reroute_scores", "reroute", "reroute_foresight", "rope_tasks")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ def test_what_is_there_is_kept(bench, twin: Twin, tmp_path: Path, monkeypatch, c
     settings = str(FOLDER.parent / "config" / "plan" / "slot.yaml")
     folder = reroute.trial_folder(tmp_path, "pred", config)
     reroute.claim_folder(folder, reroute.about(tmp_path / "pred", settings, config))
-    (folder / "5000.json").write_text("{}")
+    (folder / "8000.json").write_text("{}")
     ran = []
 
     class Here:
@@ -146,7 +146,7 @@ def test_what_is_there_is_kept(bench, twin: Twin, tmp_path: Path, monkeypatch, c
     monkeypatch.setattr(reroute, "as_completed", list)
     monkeypatch.setattr(sys, "argv", ["reroute", "run", "--work", str(tmp_path), "--trials", "2"])
     assert reroute.main() == 0
-    assert ran == [("spring-mass", 5000), ("spring-mass", 5001), ("pred", 5001)]
+    assert ran == [("spring-mass", 8000), ("spring-mass", 8001), ("pred", 8001)]
     twin.replace(physics=dataclasses.replace(twin.physics, stiffness=31.0)).save(tmp_path / "pred")
     assert reroute.main() == 2, "another twin's trials are not mixed in"
     assert "pred-truth-gap24-cable0" in capsys.readouterr().err
@@ -277,3 +277,21 @@ def test_unusable_twins_and_settings_are_refused(bench, twin: Twin, settings: Pl
         trial.check_twin(twin.replace(meta=dataclasses.replace(twin.meta, held=())))
     with pytest.raises(ConfigError, match="no slot"):
         with_gap(dataclasses.replace(settings, slot=None), SlotConfig.gap)
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "line"),
+    [
+        ("rope_tasks", ["--jobs", "0"], "argument --jobs: got '0'; allowed: 1 to 256"),
+        ("rope_tasks", ["--trials", "-3"], "argument --trials: got '-3'; allowed: 1 to 1000000"),
+        ("reroute_foresight", ["--gap", "-1"], "argument --gap: got '-1'; allowed: 0.01 to 0.1"),
+        ("reroute_foresight", ["--trials", "nan"], "argument --trials: got 'nan'"),
+    ],
+)
+def test_numbers_out_of_range_are_refused_in_a_line(
+    bench, module: str, words: list[str], line: str, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    monkeypatch.setattr(sys, "argv", [module, "--work", "nowhere", *words])
+    with pytest.raises(SystemExit) as end:
+        bench[module].main()
+    assert end.value.code == 2 and line in capsys.readouterr().err.splitlines()[-1]

@@ -275,6 +275,17 @@ def test_an_unusable_goal_is_refused_and_a_good_one_helps(
         world.live(lambda: world.plans, "a plan to the good goal")
 
 
+def test_a_refused_goal_ends_planning_to_the_old_one(files: dict[str, str]) -> None:
+    with world_of(files, enabled="true") as world:
+        world.goal(HOME + LINE + MOVE)
+        world.live(lambda: world.plans, "a plan")
+        cloud = planner_messages.goal_to_cloud(world.now(), LINE)
+        cloud.header.frame_id = "base_link"
+        world.goal_out.publish(cloud)
+        world.live(lambda: world.bench.says(ERROR, "goal/points", "base_link"), "the frame is named")
+        assert not world.bench.node._session.has_goal
+
+
 def test_bad_states_are_refused_with_the_reason(files: dict[str, str]) -> None:
     with world_of(files, enabled="true") as world:
         world.goal(HOME + LINE + MOVE)

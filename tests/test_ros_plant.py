@@ -292,6 +292,17 @@ def test_nobody_at_the_port_is_said() -> None:
         plant_arm.connect_plant(port=9, patience=0.2)
 
 
+@pytest.mark.parametrize("answer", [b"SSH-2.0-OpenSSH\r\n", b"[1]\n", b"{}\n", b"\xff\xfe\n"])
+def test_somebody_else_at_the_port_is_said(answer: bytes) -> None:
+    ours, theirs = socket.socketpair()
+    arm = plant_arm.PlantArm(ours)
+    theirs.sendall(answer)
+    with pytest.raises(InputError, match="not the plant's protocol"):
+        arm.read()
+    theirs.close()
+    arm.close()
+
+
 def test_the_sample_bag_plays_as_live_cameras() -> None:
     color: list[Image] = []
     depth: list[Image] = []

@@ -230,6 +230,12 @@ def test_lists_in_parameters() -> None:
     assert parse_cameras("cam0, cam3") == ["cam0", "cam3"]
     with pytest.raises(ConfigError, match="1 to 8"):
         parse_cameras(" ".join(f"cam{i}" for i in range(9)))
+    for name in ("cam 0$", "/cam0$", "0cam", "cam0//x", ""):
+        with pytest.raises(ConfigError, match="prefixes of topics"):
+            parse_cameras(name)
+    for text in ("nan 0 0 1 1 1", "0 0 0 -1 -1 -1", "0 0 0 1 1 inf"):
+        with pytest.raises(ConfigError, match="half sizes above 0"):
+            parse_fixtures(text)
     box = parse_fixtures("0.1 0 0.05 0.006 0.045 0.05;")[0]
     assert box.center == (0.1, 0.0, 0.05) and box.half_size == (0.006, 0.045, 0.05)
     with pytest.raises(ConfigError, match="six numbers"):

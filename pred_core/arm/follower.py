@@ -92,7 +92,7 @@ class Follower:
 
     def __init__(self, config: GuardConfig, lifetime: float):
         self._config = config
-        self._lifetime = lifetime  # [s] after its stamp a plan is followed no more
+        self._lifetime = lifetime  # [s] after its stamp a plan is followed no more; it begins no further ahead
         self._plan: Plan | None = None
         self._waiting: list[Plan] = []  # by their beginning
 
@@ -109,12 +109,20 @@ class Follower:
         """Follow a plan from its first point on, instead of those that would begin later. `here`: the present
         set-point, `now` [ns].
 
-        Raises: InputError for a plan that is over, too old, begins where the arm cannot be by then, or is one too many.
+        Raises: InputError for a plan that is over, too old, begins too far ahead or where the arm cannot be by then, or
+        is one too many.
         """
         if plan.end <= now:
             raise InputError("plan lies in the past", got=f"it ended {(now - plan.end) / NS:.3f} s ago")
         if now - plan.start > self._lifetime * NS:
             raise InputError("plan is too old", got=f"{(now - plan.start) / NS:.3f} s", allowed=f"{self._lifetime:g} s")
+        if plan.begin - now > self._lifetime * NS:
+            raise InputError(
+                "plan begins too far ahead",
+                got=f"{(plan.begin - now) / NS:.3f} s",
+                allowed=f"{self._lifetime:g} s",
+                next_step="Check the planner's clock",
+            )
         due = max(now, plan.begin)
         sooner = [p for p in self._waiting if p.begin < plan.begin]
         if len(sooner) == MOST_WAITING:
@@ -123,9 +131,9 @@ class Follower:
         known = before is not None and before.end > now
         old = before.at(due) if before is not None and known else here
         position, rotation = plan.at(due)
-        ahead = 0.0 if known else (due - now) / NS
-        most = self._config.step + self._config.speed * ahead
-        most_angle = self._config.angular_step + self._config.angular_speed * ahead
+        c = self._config  # what no plan moves goes on no longer than it takes to stop
+        ahead = 0.0 if known else min((due - now) / NS, c.speed / c.acceleration)
+        most, most_angle = c.step + c.speed * ahead, c.angular_step + c.angular_speed * ahead
         off, angle = float(np.linalg.norm(position - old[0])), angle_between(old[1], rotation)
         if off > most or angle > most_angle:
             raise InputError(

@@ -68,9 +68,13 @@ class PlantArm:
             raise InputError("plant: connection lost", got=error, next_step=START_IT) from error
         if not line:
             raise InputError("plant: the controller hung up", next_step=START_IT)
-        reply = json.loads(line)
-        if not reply["ok"]:
-            raise InputError(str(reply["error"]))
+        try:
+            reply = json.loads(line)
+            good, reason = bool(reply["ok"]), str(reply.get("error", ""))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise InputError("plant: not the plant's protocol", got=repr(line[:60]), next_step=START_IT) from error
+        if not good:
+            raise InputError(reason)
         return dict(reply)
 
 

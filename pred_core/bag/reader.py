@@ -104,7 +104,7 @@ class BagReader:
     def _damaged(self, damage: str) -> BagError:
         return BagError(
             f"{self.path.name}: truncated or damaged bag, {damage}",
-            next_step=f"'pred info {self.path.name}' shows what can still be read; record the episode again",
+            next_step="Record the episode again, or take it out of the data set",
         )
 
 

@@ -88,8 +88,12 @@ class Session:
 
     def set_goal(self, points: Array) -> None:
         """Plan towards points (Q, 3) [m] world from now on. Raises: InputError; then there is no goal."""
-        self._planner = self.distance = None
+        self.clear_goal()
         self._planner = self._make(points)
+
+    def clear_goal(self) -> None:
+        """Plan no more until there is another goal."""
+        self._planner = self.distance = None
 
     def reset(self) -> None:
         """Forget the plans in force and the last plan; the goal stays. An arm under way must come to rest first."""

@@ -15,12 +15,15 @@ from pred_core.track.grasp import GripperPath
 from pred_core.track.line_config import LineConfig
 from pred_core.track.line_tracker import LineTracker
 from pred_core.track.mask import ObjectMask
+from pred_core.track.picture_clock import PictureClock
 from pred_core.track.surface_tracker import SurfaceConfig, SurfaceTracker
 from pred_core.track.view import View, check_frame
 from pred_core.track.workspace import Shape, Workspace, check_workspace
 from pred_core.types import Array, CameraFrame, Capsule
 
 MOST_CAMERAS = 8
+GONE = 10_000_000_000  # [ns] without pictures after which the object is searched anew
+PRIOR_AGE = 0.5  # [s] from the pictures, beyond which a prior is not used
 HEARD = 1.0  # [s] for which a gripper that is there, but silent, is waited for before a line is begun
 
 
@@ -58,6 +61,7 @@ class Tracker:
         self.stale = 0  # pictures that came too late to be used
         self._line, self._surface = LineTracker(config.line), SurfaceTracker(config.surface)
         self._path = GripperPath()
+        self._clock = PictureClock()
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
         self._frames: dict[str, CameraFrame] = {}  # new ones
         self._views: dict[str, View] = {}  # used ones
@@ -69,25 +73,27 @@ class Tracker:
         """True until the object has been found."""
         return self._searching
 
-    @property
-    def waiting(self) -> tuple[str, ...]:
-        """Cameras whose next picture has not come."""
-        return tuple(c for c in self.cameras if c not in self._frames)
-
     def add_grip(self, stamp: int, position: Array, rotation: Array, closed: NDArray[np.bool_]) -> None:
         """Measured gripper poses (G, 3) [m], (G, 4) wxyz and flags (G,). Raises: InputError if not finite."""
         self._path.add(stamp, position, rotation)
         self._closed = closed
 
     def set_prior(self, prior: Prior | None) -> None:
-        """Where the predictor expects the particles; used until the next one, or for `window`."""
+        """Where the predictor expects the particles; used until the next one, or for PRIOR_AGE."""
         self._prior = prior
 
     def add_frame(self, camera: str, frame: CameraFrame) -> None:
-        """A new picture; an unused older one of this camera is dropped. Raises: InputError."""
+        """A new picture; an unused older one of this camera is dropped. Where time has gone back, or leapt by more than
+        GONE, the object is searched anew.
+
+        Raises: InputError for a picture that cannot be used, or is off the time line of the others.
+        """
         if camera not in self.cameras:
             raise InputError(f"unknown camera '{camera}'", next_step=nearest(camera, self.cameras))
         check_frame(frame, camera)
+        leap = self._clock.take(camera, frame.stamp)
+        if leap < 0 or leap > GONE:
+            self.reset()
         if frame.stamp < self._stamp - self.config.window * 1e9:
             self.stale += 1
             return
@@ -111,7 +117,7 @@ class Tracker:
             if late or self.blind_to_arm(poses) or not self._find(views, frames, stamp, poses):
                 return None
             views = [self._views[v.camera] for v in views]
-        prior = self._prior if self._prior is not None and abs(stamp - self._prior.stamp) * 1e-9 < 0.5 else None
+        prior = self._prior if self._prior is not None and abs(stamp - self._prior.stamp) * 1e-9 < PRIOR_AGE else None
         if self.config.kind == "line":
             estimate = self._line.update(views, stamp, poses, prior, self.mask.color)
         else:
