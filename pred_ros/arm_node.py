@@ -39,6 +39,7 @@ from pred_ros.shell import Shell
 
 LEVELS = {Mode.FAULT: ERROR, Mode.RAMPING: WARN}
 ACTIVE = (Mode.HOLDING, Mode.MOVING, Mode.RAMPING)
+OTHER_CLOCK = 1_000_000_000  # [ns] from the node's time: an arm's stamp farther off is not on the node's clock
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,7 @@ class ArmNode(Shell):
         self._active = False
         self._following = False  # the arm was told to follow set-points
         self._closed: bool | None = None  # as published last
+        self._measured = -1  # [ns] of the pose that was published last
         self._said: tuple[Mode, str] | None = None
 
     def setup(self) -> None:
@@ -255,9 +257,12 @@ class ArmNode(Shell):
         except InputError as error:
             self._lost(str(error))
             return None
-        self._pose_out.publish(arm_messages.reading_to_pose(now, reading))
-        if reading.joints:
-            self._joints_out.publish(arm_messages.reading_to_joints(now, reading.joints))
+        stamp = now if reading.stamp is None or abs(reading.stamp - now) > OTHER_CLOCK else reading.stamp
+        if stamp != self._measured:  # the arm may be asked more often than it measures
+            self._measured = stamp
+            self._pose_out.publish(arm_messages.reading_to_pose(stamp, reading))
+            if reading.joints:
+                self._joints_out.publish(arm_messages.reading_to_joints(stamp, reading.joints))
         if reading.closed is not None and reading.closed != self._closed:
             self._closed = reading.closed
             self._closed_out.publish(convert.closed_to_message(arm_messages.closed_flag(reading.closed)))

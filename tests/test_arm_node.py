@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -34,6 +35,7 @@ from pred_ros.processes import free_domain, node_command, node_environment
 
 HOME = np.array([0.45, 0.0, 0.25])
 DOWN = (0.0, 1.0, 0.0, 0.0)
+MEASURES = 50_000_000  # [ns]
 
 
 class World:
@@ -214,6 +216,35 @@ class Troubled(DryRunArm):
         """Remembered."""
         self.calls.append("stop")
         super().stop()
+
+
+class Measuring(DryRunArm):
+    """A dry run that measures every 50 ms and says when."""
+
+    def __init__(self, clock: Callable[[], int]):
+        super().__init__(HOME, DOWN)
+        self.clock, self.off = clock, 0
+
+    def read(self) -> Reading:
+        """As the plant does."""
+        stamp = self.clock() // MEASURES * MEASURES + self.off
+        return dataclasses.replace(super().read(), stamp=stamp)
+
+
+def test_poses_bear_the_time_of_their_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each measurement is published once, with its own stamp; a stamp of another clock is not believed."""
+    arm = Measuring(time.time_ns)
+    monkeypatch.setattr(arm_node, "make_arm", lambda config: arm)
+    with arm_world() as world:
+        world.poses.clear()
+        world.wait(0.5)
+        stamps = [stamp_of(p) for p in world.poses]
+        assert len(stamps) > 3 and all(s % MEASURES == 0 for s in stamps) and len(set(stamps)) == len(stamps)
+        arm.off = 3_600_000_000_000
+        world.wait(0.2)
+        world.poses.clear()
+        world.wait(0.3)
+        assert world.poses and all(abs(stamp_of(p) - world.now()) < 1_000_000_000 for p in world.poses)
 
 
 @pytest.mark.parametrize("how", ["protective stop", "connection lost"])

@@ -33,7 +33,8 @@ class PlantArm:
             raise InputError("plant: the controller reports no pose", got=f"{reply['position']} {reply['rotation']}")
         joints = {str(k): float(v) for k, v in reply["joints"].items()}
         turned = (rotation[0], rotation[1], rotation[2], rotation[3])
-        return Reading(position, turned, bool(reply["ready"]), str(reply["message"]), bool(reply["closed"]), joints)
+        ready, message, closed = bool(reply["ready"]), str(reply["message"]), bool(reply["closed"])
+        return Reading(position, turned, ready, message, closed, joints, int(reply["stamp"]))
 
     def begin(self) -> None:
         """Take set-points from now on. Raises: InputError after a fault, which only the plant's ~/clear ends."""

@@ -33,6 +33,7 @@ class Reading:
     message: str  # one line: why it is not ready, or its mode
     closed: bool | None = None  # the jaws; None: the arm does not know
     joints: dict[str, float] = field(default_factory=dict)  # [rad] by name; empty: unknown
+    stamp: int | None = None  # [ns] of the measurement, on the node's clock; None: the arm does not say, now
 
 
 class Arm(Protocol):

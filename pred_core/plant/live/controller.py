@@ -84,6 +84,7 @@ class Controller:
             "rotation": truth.gripper.rotation.tolist(),
             "closed": truth.closed,
             "joints": truth.joints,
+            "stamp": truth.stamp,
             "ready": not self._servo.fault,
             "message": self._servo.fault or ("following" if self._servo.following else "idle"),
         }
