@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -33,7 +34,7 @@ from pred_core.errors import ConfigError, PredError
 from pred_core.track.estimate import Estimate, Prior
 from pred_core.track.line_config import LineConfig
 from pred_core.track.surface_tracker import SurfaceConfig
-from pred_core.track.tracker import HEARD, MOST_CAMERAS, Tracker, TrackerConfig
+from pred_core.track.tracker import HEARD, MOST_CAMERAS, Masks, Tracker, TrackerConfig
 from pred_core.track.workspace import Workspace
 from pred_core.types import Box
 from pred_ros import convert, qos, shell
@@ -67,6 +68,9 @@ class TrackerNodeConfig:
     arm_radius: float = setting(0.0, unit="m", low=0.0, high=0.3, doc="of the arm above each gripper; 0: none in view")
     arm_start: float = setting(0.05, unit="m", low=-0.5, high=0.5, doc="of it, along the gripper's +z")
     arm_end: float = setting(0.4, unit="m", low=-0.5, high=2.0, doc="of it, along the gripper's +z")
+    masks: str = setting("", doc="folder with SAM 2, which follows the object's masks; empty: masks without weights")
+    detector: str = setting("", doc="folder with Grounding DINO, which finds the object for `masks`")
+    object: str = setting("", doc="what `detector` looks for, e.g. white rope")
     prior: bool = setting(False, doc="use state/points of the predictor as motion prior")
     prior_sigma: float = setting(0.01, unit="m", low=1e-3, high=0.5, doc="standard deviation of the prior")
     patience: float = setting(0.03, unit="s", low=0.0, high=1.0, doc="wait for the other cameras after the first")
@@ -85,6 +89,15 @@ def core_config(config: TrackerNodeConfig) -> TrackerConfig:
         line=LineConfig(length=config.length, radius=config.radius, particles=config.particles),
         surface=SurfaceConfig(particles=config.particles),
     )
+
+
+def learned_masks(config: TrackerNodeConfig) -> Masks | None:
+    """The learned masks that are asked for. Raises: ConfigError without weights, packages or a name."""
+    if not config.masks and not config.detector:
+        return None
+    from pred_core.track.learned_masks import load_named_object  # torch: seconds, which nobody else here needs
+
+    return load_named_object(config.object, Path(config.detector), Path(config.masks))
 
 
 def parse_cameras(text: str) -> list[str]:
@@ -147,7 +160,7 @@ class TrackerNode(Shell):
         """Check the parameters, build the tracker."""
         config: TrackerNodeConfig = self.config
         self._names = parse_cameras(config.cameras)
-        self._tracker = Tracker(core_config(config), self._names)
+        self._tracker = Tracker(core_config(config), self._names, learned_masks(config))
         self._tracker.fixtures = parse_fixtures(config.fixtures)
         self._out = self.create_publisher(PointCloud2, TRACKER_POINTS, qos.points_complete())
         self.create_service(Trigger, "~/reset", self._on_reset)

@@ -11,8 +11,11 @@ import pytest
 import torch
 
 from pred_core.errors import ConfigError
-from pred_core.track.learned_masks import MaskFollower, TextDetector
+from pred_core.track.learned_masks import MaskFollower, NamedObject, TextDetector, load_named_object
 from pred_core.track.learned_points import CoTracker3, TapNext
+from pred_core.track.line_config import LineConfig
+from pred_core.track.tracker import Tracker, TrackerConfig
+from pred_core.track.workspace import Workspace
 
 RGB = np.full((32, 48, 3), 100, np.uint8)
 MISSING = [name for name in ("transformers", "torchvision") if importlib.util.find_spec(name) is None]
@@ -86,3 +89,88 @@ def test_small_random_sam2_follows_a_box(tmp_path: Path) -> None:
     follower = MaskFollower(tmp_path)
     assert follower.start(RGB, np.array([4.0, 4.0, 20.0, 20.0])).shape == RGB.shape[:2]
     assert follower.follow(RGB).shape == RGB.shape[:2]
+
+
+class Finder:
+    """Finds one box where a picture has a bright column; counts how often it is asked."""
+
+    asked = 0
+
+    def find(self, rgb: np.ndarray, text: str) -> tuple[np.ndarray, np.ndarray]:
+        self.asked += 1
+        assert text == "white rope"
+        columns = np.nonzero(rgb[0, :, 0] > 200)[0]
+        return np.array([[columns[0], 0.0, columns[-1] + 1.0, 8.0]] if len(columns) else []).reshape(-1, 4), np.ones(1)
+
+
+class Bright:
+    """Follows what is bright."""
+
+    def another(self) -> Bright:
+        return Bright()
+
+    def start(self, rgb: np.ndarray, box: np.ndarray) -> np.ndarray:
+        assert box.shape == (4,)
+        return self.follow(rgb)
+
+    def follow(self, rgb: np.ndarray) -> np.ndarray:
+        return np.asarray(rgb[..., 0] > 200)
+
+
+def test_a_named_object_is_found_once_a_camera_and_again_when_it_is_lost() -> None:
+    finder = Finder()
+    masks = NamedObject("white rope", finder, Bright())  # type: ignore[arg-type]
+    there, gone = np.zeros((8, 6, 3), np.uint8), np.zeros((8, 6, 3), np.uint8)
+    there[:, 2:4] = 255
+    for camera in ("cam0", "cam1"):
+        for _ in range(3):
+            assert np.array_equal(masks.mask(camera, there), there[..., 0] > 200)
+    assert finder.asked == 2
+    assert not masks.mask("cam0", gone).any() and finder.asked == 2
+    assert not masks.mask("cam0", gone).any() and finder.asked == 3
+    assert masks.mask("cam0", there).any() and finder.asked == 4
+    masks.reset()
+    assert masks.mask("cam1", there).any() and finder.asked == 5
+
+
+def test_a_mask_keeps_the_tracker_to_the_object() -> None:
+    """Masks that see nothing leave nothing to track; those that see all change nothing."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    from track_scenes import LENGTH, STEP, HangingRope
+
+    class Given:
+        """The same everywhere."""
+
+        def __init__(self, value: bool):
+            self.value = value
+
+        def mask(self, camera: str, rgb: np.ndarray) -> np.ndarray:
+            return np.full(rgb.shape[:2], self.value)
+
+        def reset(self) -> None:
+            """Nothing is kept."""
+
+    config = TrackerConfig(
+        workspace=Workspace((-0.5, -0.5, 0.0), (0.5, 0.5, 0.9)), line=LineConfig(particles=26, length=LENGTH)
+    )
+    scene = HangingRope()
+    found = {}
+    for name, masks in (("none", None), ("all", Given(True)), ("nothing", Given(False))):
+        tracker = Tracker(config, list(scene.cameras.configs), masks)
+        scene.generator = np.random.default_rng(0)
+        for k in range(3):
+            stamp = 20_000_000_000 + k * STEP
+            tracker.add_grip(**scene.grip(stamp))
+            for camera, frame in scene.frames(stamp).items():
+                tracker.add_frame(camera, frame)
+            found[name] = tracker.step()
+    scene.close()
+    assert found["none"] is not None and found["nothing"] is None
+    assert np.array_equal(found["all"].tracks.position, found["none"].tracks.position)
+
+
+def test_a_tracker_without_weights_says_where_they_are_missed(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="Grounding DINO: no weights on disk"):
+        load_named_object("rope", tmp_path, tmp_path)
+    with pytest.raises(ConfigError, match="need the object's name"):
+        load_named_object(" ", tmp_path, tmp_path)

@@ -5,6 +5,7 @@ Nothing is downloaded. Both come from the `transformers` package; the folders ar
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,12 @@ class MaskFollower:
         self._device = device
         self._session: Any = None
 
+    def another(self) -> MaskFollower:
+        """One for another camera, which shares the model."""
+        other = copy.copy(self)
+        other._session = None
+        return other
+
     def start(self, rgb: Picture, box: NDArray[np.float64]) -> Mask:
         """Begin with a box (4,) [px] in (H, W, 3). Returns the mask (H, W)."""
         self._session = self._processor.init_video_session(inference_device=self._device)
@@ -102,3 +109,37 @@ class MaskFollower:
             outputs = self._model(inference_session=self._session, frame=inputs.pixel_values[0])
         masks = self._processor.post_process_masks([outputs.pred_masks], original_sizes=[size], binarize=True)[0]
         return np.asarray(masks[0, 0].cpu().numpy(), bool)
+
+
+class NamedObject:
+    """Masks of what a text names, in the pictures of several cameras: found once a camera, then followed."""
+
+    def __init__(self, text: str, detector: TextDetector, follower: MaskFollower):
+        self._text, self._detector, self._follower = text, detector, follower
+        self._following: dict[str, MaskFollower] = {}
+
+    def mask(self, camera: str, rgb: Picture) -> Mask:
+        """The mask (H, W) in the camera's next picture (H, W, 3). What was lost is looked for anew."""
+        follower = self._following.get(camera)
+        if follower is not None:
+            mask = follower.follow(rgb)
+        else:
+            boxes, _ = self._detector.find(rgb, self._text)
+            if not len(boxes):
+                return np.zeros(rgb.shape[:2], bool)
+            follower = self._following[camera] = self._follower.another()
+            mask = follower.start(rgb, boxes[0])
+        if not mask.any():
+            del self._following[camera]
+        return mask
+
+    def reset(self) -> None:
+        """Look for it anew in every camera."""
+        self._following.clear()
+
+
+def load_named_object(text: str, detector: Path, follower: Path) -> NamedObject:
+    """Both models from disk. Raises: ConfigError without weights, packages or a text."""
+    if not text.strip():
+        raise ConfigError("learned masks need the object's name", next_step="e.g. object:='white rope'")
+    return NamedObject(text, TextDetector(detector), MaskFollower(follower))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,11 +42,24 @@ class TrackerConfig:
     surface: SurfaceConfig = SurfaceConfig()
 
 
+class Masks(Protocol):
+    """Where the object is in a picture, from a learned model."""
+
+    def mask(self, camera: str, rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """The mask (H, W) in the camera's next picture (H, W, 3)."""
+
+    def reset(self) -> None:
+        """Look for the object anew."""
+
+
 class Tracker:
     """Online and causal. Feed `add_frame` in any order; `step` takes what is new."""
 
-    def __init__(self, config: TrackerConfig, cameras: Sequence[str]):
-        """Raises: ConfigError for no camera, more than eight, or an empty workspace."""
+    def __init__(self, config: TrackerConfig, cameras: Sequence[str], masks: Masks | None = None):
+        """`masks`: a learned model's, beside workspace, table and colour.
+
+        Raises: ConfigError for no camera, more than eight, or an empty workspace.
+        """
         if not 1 <= len(set(cameras)) == len(cameras) <= MOST_CAMERAS:
             raise ConfigError(
                 "tracker: cameras",
@@ -54,7 +68,7 @@ class Tracker:
                 next_step="Name them, e.g. cameras:=cam0,cam1",
             )
         check_workspace(config.workspace)
-        self.config, self.cameras = config, tuple(cameras)
+        self.config, self.cameras, self._masks = config, tuple(cameras), masks
         self.mask = ObjectMask(config.workspace)
         self.fixtures: tuple[Shape, ...] = ()
         self.robot: tuple[Shape, ...] = ()
@@ -108,7 +122,8 @@ class Tracker:
         poses = self._path.at(stamp)
         self.mask.shapes = (*self.fixtures, *self.robot, *self._arms(poses))
         if self.config.kind == "line" or self._searching:
-            self._views.update({c: self.mask.view(c, f) for c, f in frames.items()})
+            given = {c: None if self._masks is None else self._masks.mask(c, f.rgb) for c, f in frames.items()}
+            self._views.update({c: self.mask.view(c, f, given[c]) for c, f in frames.items()})
         oldest = stamp - self.config.window * 1e9
         self._views = {c: v for c, v in self._views.items() if v.stamp >= oldest}
         views = [self._views[c] for c in self.cameras if c in self._views]
@@ -139,6 +154,8 @@ class Tracker:
         self._line, self._surface = LineTracker(self.config.line), SurfaceTracker(self.config.surface)
         self.mask.color = None
         self._frames, self._views, self._searching = {}, {}, True
+        if self._masks is not None:
+            self._masks.reset()
 
     def _find(
         self, views: list[View], frames: dict[str, CameraFrame], stamp: int, poses: tuple[Array, Array] | None
