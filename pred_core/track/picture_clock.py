@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pred_core.errors import InputError
 
-LEAP = 1_000_000_000  # [ns] a stamp farther from the newest is believed when others confirm it
+LEAP = 1_500_000_000  # [ns] a stamp farther from the newest is believed when others confirm it; a reset cell skips 1 s
 ALONE = 3  # pictures of one camera in a row that confirm each other, where no other camera contradicts
 
 
