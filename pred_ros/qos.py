@@ -51,11 +51,6 @@ def images() -> QoSProfile:
     )
 
 
-def images_reliable() -> QoSProfile:
-    """Pictures of a bag: what is lost is lost in the reader. Ten, not all: a slow reader must not fill the memory."""
-    return _profile(10, DurabilityPolicy.VOLATILE)
-
-
 def latched(depth: int = 1) -> QoSProfile:
     """What a late reader must still get: gripper/closed, episode marks, camera poses, goals."""
     return _profile(depth, DurabilityPolicy.TRANSIENT_LOCAL)

@@ -23,6 +23,7 @@ from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, REQUIRED, TRACKER_P
 from pred_core.errors import BagError
 from pred_core.types import Episode
 
+BURSTS = 100.0  # times the median step that the mean one has only where messages come in bursts
 LATE = 1.5  # periods between two messages from which one counts as lost
 
 
@@ -107,8 +108,8 @@ class _Clock:
             topic.rate = 1.0 / period
             regular = steps[(steps > 0) & (steps < LATE * period)]
             topic.jitter = float(regular.std() / period) if len(regular) else 0.0
-            # Where several senders write in turns, there is no period that a message could be missing from.
-            if ((steps > period / LATE) & (steps < LATE * period)).mean() >= 0.5:
+            # Where several senders write in bursts, no period says what is missing.
+            if period * BURSTS > steps.mean():
                 topic.lost = int(np.round(steps[steps >= LATE * period] / period - 1.0).sum())
 
 

@@ -31,8 +31,8 @@ INSIDE = 1e-6  # [typical changes] of the bounds, where the global search must b
 class Start:
     """A point to refine from, and what it saves there, or a straight line promises."""
 
-    z: Array
-    promise: float  # loss
+    z: Array  # (P,) coordinates
+    promise: float  # of the loss, averaged over all windows
 
 
 def first_values(
@@ -47,9 +47,7 @@ def first_values(
         return [effect.extension()]
     weight = error.reshape(-1) ** 2
     weight = weight / weight.sum() if weight.sum() > 0 else np.full(weight.size, 1.0 / weight.size)
-    w = roller.sample.windows
-    stride = max(1, len(w.target) // error.shape[1])
-    target = w.target[stride - 1 :: stride].movedim(0, 1)[:, : error.shape[1]].reshape(-1, 3).numpy()
+    target = _measured(roller, error.shape[1])
     result = []
     for n in range(count):
         place = target[int(rng.choice(len(target), p=weight))] + rng.normal(0.0, 0.06, 3)
@@ -69,6 +67,13 @@ def first_values(
     return result
 
 
+def _measured(roller: Roller, frames: int) -> Array:
+    """(W K N, 3) [m] world: where the object was measured at the K frames a window that residuals have."""
+    target = roller.sample.windows.target
+    stride = max(1, len(target) // frames)
+    return np.asarray(target[stride - 1 :: stride].movedim(0, 1)[:, :frames].reshape(-1, 3).numpy())
+
+
 def solid_values(
     effect: type[Effect], roller: Roller, push: Array, count: int, rng: np.random.Generator
 ) -> list[Extension]:
@@ -81,9 +86,7 @@ def solid_values(
     size = np.linalg.norm(vector, axis=1)
     if solid is None or not size.any():
         return []
-    w = roller.sample.windows
-    stride = max(1, len(w.target) // push.shape[1])
-    target = w.target[stride - 1 :: stride].movedim(0, 1)[:, : push.shape[1]].reshape(-1, 3).numpy()
+    target = _measured(roller, push.shape[1])
     result = []
     for row in rng.choice(len(size), count, p=size**2 / (size**2).sum()):
         away = vector[row] / size[row] + rng.normal(0.0, ASKEW, 3)

@@ -56,7 +56,7 @@ class Tracker:
     """Online and causal. Feed `add_frame` in any order; `step` takes what is new."""
 
     def __init__(self, config: TrackerConfig, cameras: Sequence[str], masks: Masks | None = None):
-        """`masks`: a learned model's, beside workspace, table and colour.
+        """`masks`: a learned model's, beside workspace, table and colour; sheets and volumes are only found with them.
 
         Raises: ConfigError for no camera, more than eight, or an empty workspace.
         """
@@ -79,6 +79,7 @@ class Tracker:
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
         self._frames: dict[str, CameraFrame] = {}  # new ones
         self._views: dict[str, View] = {}  # used ones
+        self._given: dict[str, NDArray[np.bool_]] = {}  # masks of the pictures in use
         self._prior: Prior | None = None
         self._searching = True
 
@@ -122,8 +123,9 @@ class Tracker:
         poses = self._path.at(stamp)
         self.mask.shapes = (*self.fixtures, *self.robot, *self._arms(poses))
         if self.config.kind == "line" or self._searching:
-            given = {c: None if self._masks is None else self._masks.mask(c, f.rgb) for c, f in frames.items()}
-            self._views.update({c: self.mask.view(c, f, given[c]) for c, f in frames.items()})
+            if self._masks is not None:
+                self._given = {c: self._masks.mask(c, f.rgb) for c, f in frames.items()}
+            self._look(frames)
         oldest = stamp - self.config.window * 1e9
         self._views = {c: v for c, v in self._views.items() if v.stamp >= oldest}
         views = [self._views[c] for c in self.cameras if c in self._views]
@@ -171,9 +173,13 @@ class Tracker:
         if self.mask.color is None:
             pairs = [(frames[m.camera], m.pixel) for m in members if m.camera in frames]
             self.mask.learn([f for f, _ in pairs], [p for _, p in pairs])
-            self._views.update({c: self.mask.view(c, f) for c, f in frames.items()})
+            self._look(frames)
         self._searching = False
         return True
+
+    def _look(self, frames: dict[str, CameraFrame]) -> None:
+        """Candidates in the pictures, within what a learned model says where there is one."""
+        self._views.update({c: self.mask.view(c, f, self._given.get(c)) for c, f in frames.items()})
 
     def _arms(self, poses: tuple[Array, Array] | None) -> tuple[Shape, ...]:
         """The arm as a capsule above each gripper."""
