@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
-from pred_core.bag.clouds import read_tracker_points
+from pred_core.bag.clouds import PointFrame, read_tracker_points
 from pred_core.bag.dataset import load_dataset
-from pred_core.bag.grippers import read_gripper_closed, read_gripper_pose
+from pred_core.bag.grippers import PoseFrame, read_gripper_closed, read_gripper_pose
 from pred_core.bag.reader import open_bag
 from pred_core.bag.wire import GRIPPER_POSE, REQUIRED, TRACKER_POINTS
 from pred_core.evaluate.protocol import predict
@@ -68,3 +69,41 @@ def test_message_by_message_equals_the_offline_batch_with_the_network() -> None:
     assert base.running is False
     (without,) = predict(load_dynamics(twin.replace(residual=None)), [episode])
     assert np.abs(without[:frames] - offline[:frames]).max() > 1e-4, "the network takes part"
+
+
+@pytest.mark.parametrize("rate", [75.0, 20.0, 18.0, 12.0, 125.0])
+def test_poses_at_another_rate_than_the_twin_steps_give_the_same_motion(rate: float) -> None:
+    """A step lasts its period, whatever comes how often: 15 Hz of tracks and steps, a gripper led at constant speed."""
+    twin = Twin.load(Path(__file__).parents[1] / "config" / "twins" / "cell_rope")
+    same, other = (led(twin, pace, 1.6) for pace in (15.0, rate))
+    assert len(same) >= 20
+    common = [(same[k], other[k]) for k in same if k in other]
+    assert len(common) >= 19, "the last step waits for a pose beyond it"
+    # Poses in between lie on the same straight line: what is left is float32.
+    assert max(float(np.abs(a - b).max()) for a, b in common) < 2e-5
+
+
+def led(twin: Twin, rate: float, seconds: float) -> dict[int, np.ndarray]:
+    """Predicted positions by step, of a straight rope led along +x at 0.3 m/s with poses at `rate` [Hz]."""
+    begin, speed = 3_000_000_000, np.array([0.3, 0.0, 0.0])
+    place = np.zeros((twin.body.count, 3))
+    place[:, 2] = 1.0 - np.concatenate(([0.0], np.cumsum(twin.body.rest_length)))
+    predictor = Predictor(load_dynamics(twin), twin.body.id, {0: 0}, Rules())
+    period = twin.meta.period
+    arrivals = [(round(k / rate * 1e9), 0) for k in range(round(seconds * rate) + 1)]
+    arrivals += [(round(k * period * 1e9), 1) for k in range(round(seconds / period) + 1)]
+    found: dict[int, np.ndarray] = {}
+    with torch.no_grad():
+        for stamp, is_track in sorted(arrivals):
+            at = speed * (stamp * 1e-9)
+            if is_track:
+                seen = np.ones(len(place), np.float32)
+                predictor.add_points(PointFrame(begin + stamp, place + at, twin.body.id, seen, None))
+            else:
+                grip = PoseFrame(begin + stamp, (at + [0.0, 0.0, 1.0])[None], np.array([[1.0, 0.0, 0.0, 0.0]]))
+                predictor.add_pose(grip, np.array([True]))
+            for prediction in predictor.advance():
+                step = round((prediction.stamp - begin) * 1e-9 / period)
+                assert abs(prediction.stamp - begin - step * period * 1e9) < 1e6, "on the grid"
+                found[step] = prediction.state.position.double().numpy()
+    return found

@@ -28,7 +28,10 @@ from pred_core.live.laps import Laps, Time
 from pred_core.live.prediction_records import Counts, Pose, Prediction, Rules, grip_of
 from pred_core.types import Grip, State
 
-ON_GRID = 0.25  # periods; a pose this close to the next step is taken as it is
+ON_GRID = 0.25  # periods; where poses come once a period, one this close to the next step is the step
+EXACT = 1e-3  # periods; else only one this close is: between others the gripper is interpolated
+PACE = 0.1  # periods by which the time between poses may differ from one, where they come once a period
+SPACINGS = 9  # between poses, whose median counts
 MAX_WAITING = 4_000  # tracker frames kept while poses are awaited, and poses while frames are
 
 
@@ -63,6 +66,7 @@ class Run:
         self._begin: Time = (-1, 0)  # frames before it belong to what is over
         self._cancelled = False
         self._before: Pose | None = None  # the last pose at or before the state's next time
+        self._spacings: deque[int] = deque(maxlen=SPACINGS)  # [ns] between the newest poses
         self.halted: DivergenceError | None = None
         self.counts = Counts()
 
@@ -74,7 +78,9 @@ class Run:
     @property
     def backlog(self) -> float:
         """[s] of poses that wait to be stepped over."""
-        return len(self._poses) * self._dynamics.period if self.running else 0.0
+        if not self.running or not self._poses or self._poses[-1].lap != self._time[0]:
+            return len(self._poses) * self._dynamics.period if self.running else 0.0
+        return (self._poses[-1].pose.stamp - self._time[1]) * 1e-9
 
     def waiting(self) -> str:
         """What a start lacks."""
@@ -160,6 +166,9 @@ class Run:
             self.counts.dropped_poses += 1
         if self._before is not None and self._before.time >= pose.time:
             self._end_run(pose)
+        newest = self._poses[-1] if self._poses else self._before
+        if newest is not None and newest.lap == pose.lap:
+            self._spacings.append(pose.pose.stamp - newest.pose.stamp)
         self._begin = min(self._begin, pose.time)
         if pose.lap > self._pose_lap:
             self._pose_lap = pose.lap
@@ -187,12 +196,13 @@ class Run:
 
         None: with no pose waiting, it may still come; else the poses begin later, and it never will.
         """
-        while self._poses and self._poses[0].time < (time[0], time[1] - round(ON_GRID * self._period)):
+        near = self._near()
+        while self._poses and self._poses[0].time < (time[0], time[1] - near):
             self._before = self._poses.popleft()
         if not self._poses:
             return None
         pose = self._poses[0]
-        if pose.lap != time[0] or pose.pose.stamp - time[1] > ON_GRID * self._period:
+        if pose.lap != time[0] or pose.pose.stamp - time[1] > near:
             if self._before is None or self._before.lap != time[0] or self._ends_run(pose):
                 return None
             return self._between(self._before, pose, time[1])
@@ -207,11 +217,12 @@ class Run:
         assert self._before is not None
         next_stamp = self._time[1] + self._period
         offset = pose.pose.stamp - next_stamp
-        if offset < -ON_GRID * self._period:
+        near = self._near()
+        if offset < -near:
             self.counts.unused_poses += 1
             self._before = pose
             return None
-        if offset > ON_GRID * self._period:
+        if offset > near:
             self._poses.appendleft(pose)
             self.counts.interpolated += 1
             grip, stamp, last = self._between(self._before, pose, next_stamp), next_stamp, self._before
@@ -219,6 +230,13 @@ class Run:
             grip, stamp, last = pose.grip(), pose.pose.stamp, pose
         previous, self._before = self._before, last
         return grip, stamp, previous
+
+    def _near(self) -> int:
+        """How far from a step's time [ns] a pose may lie to be the step. Poses that come once a period set the pace,
+        whatever their clock; between those that come more or less often, a step lasts its period.
+        """
+        usual = float(np.median(self._spacings)) / self._period if self._spacings else 1.0
+        return round((ON_GRID if abs(usual - 1.0) <= PACE else EXACT) * self._period)
 
     def _stepped(self, state: State, grip: Grip, stamp: int) -> State:
         """One step that must stay finite. Raises: DivergenceError; the run is over then."""
