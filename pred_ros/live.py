@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from pred_core.bag.dataset import load_dataset
+from pred_core.bag.playlist import Clip, find_clips
 from pred_core.errors import PredError
-from pred_ros.playlist import Clip, find_clips
 from pred_ros.processes import Children, free_domain, node_command, node_environment
 
 START = 60.0  # [s] for three interpreters to start, load the twin and compile its kernels

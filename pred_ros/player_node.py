@@ -24,6 +24,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String, UInt8MultiArray
 from std_srvs.srv import SetBool
 
+from pred_core.bag.playlist import Clip, Timed, find_clips, stream
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
 from pred_core.config import setting
 from pred_core.errors import ConfigError, InputError, PredError
@@ -31,7 +32,6 @@ from pred_core.live import marks
 from pred_ros import convert, qos, shell
 from pred_ros.diagnostics import OK, WARN
 from pred_ros.played_pictures import PlayedPictures
-from pred_ros.playlist import Clip, Timed, find_clips, stream
 from pred_ros.shell import Shell
 
 LATE = 0.05  # [s] behind its schedule before the player says so

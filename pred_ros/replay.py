@@ -1,6 +1,6 @@
 """The main job in one command: a measured cable replayed as topics, predicted live, scored, reported.
 
-`python -m pred_ros.replay` (or `pred_replay`, or `make run`) looks for measured data, converts and identifies
+`python -m pred_ros.replay` (or `pred_replay`, or `make run`) looks for measured data, tracks, converts and identifies
 what is missing, runs player, predictor and evaluator, then `pred evaluate` for the full table.
 """
 
@@ -15,13 +15,18 @@ from pathlib import Path
 
 from pred_core.bag.dataset import FILE, load_dataset
 from pred_core.bag.measured import find_measured
+from pred_core.bag.playlist import find_clips
+from pred_core.bag.wire import TRACKER_POINTS
 from pred_core.cli.main import INTERRUPTED
 from pred_core.errors import PredError
 from pred_ros.commands import run_command
 from pred_ros.live import Replay, replay
-from pred_ros.resources import config_folder, sample_dataset
+from pred_ros.resources import config_folder, sample_dataset, sample_pictures
 
 MEASURED = ("deform_dlo2", "deform_dlo1")  # in this order
+PICTURES_TWIN, PICTURES_SETTINGS = "cell_rope", "nodes/reroute.yaml"  # in config/: of the bundled bag of cameras
+PICTURES_OBJECT = "rope"
+PICTURES_HELD = "0:0 1:0"  # the jaws hold the rope's end, and its direction
 SAMPLE = "bundled and synthetic; no measured data found (set PRED_DATA to their folder)"
 TWIN_FILE = "twin.yaml"
 
@@ -31,8 +36,13 @@ class Source:
     """Where the data come from."""
 
     name: str
-    path: Path  # an .npz to convert, or a data set
+    path: Path  # an .npz to convert, a data set, or pictures to track: a bag, or a data set of such bags
     origin: str  # said to the user
+    pictures: bool = False
+    settings: Path | None = None  # of the tracker
+    object: str = ""  # its name, in pictures; default: the source's
+    held: str = ""  # particle:gripper pairs, for pictures
+    twin: Path | None = None  # the one it is meant for
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -43,11 +53,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Choose, prepare, replay, evaluate, and say where everything is. Returns 0. Raises: PredError."""
-    source = choose_source(args.dataset)
+    source = sample_source() if args.cameras else choose_source(args.dataset, args.settings)
     out = args.out / source.name
     print(f"1. data: {source.name}, {source.origin}: {source.path}", flush=True)
     dataset = prepare_dataset(source, args.out / "datasets" / source.name)
-    twin = args.twin or prepare_twin(source, dataset, args.out / "twins" / source.name)
+    twin = args.twin or source.twin or prepare_twin(source, dataset, args.out / "twins" / source.name)
     print(f"2. twin: {twin}", flush=True)
     names = episode_names(dataset, args.split, args.episodes)
     print(f"3. replay of {len(names)} episodes at {args.factor:g} x real time over ROS 2 topics", flush=True)
@@ -68,10 +78,14 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def choose_source(dataset: Path | None) -> Source:
-    """The data set given, else measured data, else the bundled sample. Raises: PredError."""
+def choose_source(dataset: Path | None, settings: Path | None = None) -> Source:
+    """The data set or bag of pictures given, else measured data, else the bundled sample. Raises: PredError."""
     if dataset is not None:
-        return Source(load_dataset(dataset).object.name, dataset, "the data set given")
+        is_bag = not (dataset / FILE).is_file() and (dataset.is_file() or any(dataset.glob("*.mcap")))
+        pictures = (is_bag or load_dataset(dataset)) and TRACKER_POINTS not in find_clips(dataset)[0].topics
+        name = dataset.stem if is_bag and pictures else load_dataset(dataset).object.name
+        origin = "given, pictures to be tracked" if pictures else "given"
+        return Source(name, dataset, origin, bool(pictures), settings)
     for name in MEASURED:
         found = find_measured(name)
         if found is not None:
@@ -79,8 +93,28 @@ def choose_source(dataset: Path | None) -> Source:
     return Source("sample_cable", sample_dataset(), SAMPLE)
 
 
+def sample_source() -> Source:
+    """The bundled bag of four cameras, with the tracker's settings and the twin of its cell. Raises: PredError."""
+    config = config_folder()
+    return Source(
+        "sample_cameras",
+        sample_pictures(),
+        "bundled and synthetic: four cameras, pictures to be tracked",
+        pictures=True,
+        settings=config / PICTURES_SETTINGS,
+        object=PICTURES_OBJECT,
+        held=PICTURES_HELD,
+        twin=config / "twins" / PICTURES_TWIN,
+    )
+
+
 def prepare_dataset(source: Source, folder: Path) -> Path:
-    """The data set of a source, converted into `folder` if it is not one yet. Raises: PredError."""
+    """The data set of a source, tracked or converted into `folder` if it is not one yet. Raises: PredError."""
+    if source.pictures:
+        options = ["--settings", str(source.settings)] if source.settings is not None else []
+        options += ["--held", source.held] if source.held else []
+        command("track", str(source.path), "--out", str(folder), "--name", source.object or source.name, *options)
+        return folder
     if (source.path / FILE).is_file():
         return source.path
     if not (folder / FILE).is_file():
@@ -115,7 +149,12 @@ def command(*arguments: str) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="pred_replay", description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--dataset", type=Path, help="data set folder; default: measured data, else the sample")
+    data = parser.add_mutually_exclusive_group()
+    data.add_argument(
+        "--dataset", type=Path, help="data set, or a bag of pictures; default: measured data, else the sample"
+    )
+    data.add_argument("--cameras", action="store_true", help="the bundled bag of four RGB-D cameras")
+    parser.add_argument("--settings", type=Path, metavar="YAML", help="of the tracker, for pictures")
     parser.add_argument("--twin", type=Path, help="twin folder; default: the one that ships, else identify one")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for everything that is written")
     parser.add_argument("--split", default="test", choices=("all", "train", "test", "ood"), help="episodes to replay")

@@ -26,6 +26,7 @@ from pred_core.plan.endpoints import read_cloud
 from pred_core.plan.goal import size_of
 from pred_core.plan.task import load_settings
 from pred_core.plant.live.slot import SlotConfig
+from pred_core.track.settings import parse_fixtures
 from pred_core.twin import Twin
 from pred_core.types import Array
 from pred_ros.bringup import apply_overrides, read_nodes
@@ -36,7 +37,6 @@ from pred_ros.reroute_loop import BAG, Job, run
 from pred_ros.reroute_report import PAGE, VIDEO, lead, outcome, write_report
 from pred_ros.reroute_verdict import Verdict, judge
 from pred_ros.resources import config_folder
-from pred_ros.tracker_node import parse_fixtures
 
 NOT_REACHED = 1
 NODES = ("plant", "tracker", "predictor", "planner", "arm")

@@ -21,6 +21,11 @@ def sample_dataset() -> Path:
     return _find("bags/sample_cable", "dataset.yaml")
 
 
+def sample_pictures() -> Path:
+    """The bundled bag of four cameras. Raises: ConfigError if the installation is incomplete."""
+    return _find("bags", "sample_cameras.mcap") / "sample_cameras.mcap"
+
+
 def fastdds_profile() -> Path:
     """The Fast DDS profile with a large shared-memory segment."""
     return config_folder() / "fastdds.xml"

@@ -7,13 +7,11 @@ with `prior` state/points. Out: tracker/points with the stamp of the newest pict
 from __future__ import annotations
 
 import functools
-import re
 import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -32,11 +30,8 @@ from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, STATE_POINTS, TRACK
 from pred_core.config import setting
 from pred_core.errors import ConfigError, PredError
 from pred_core.track.estimate import Estimate, Prior
-from pred_core.track.line_config import LineConfig
-from pred_core.track.surface_tracker import SurfaceConfig
-from pred_core.track.tracker import HEARD, MOST_CAMERAS, Masks, Tracker, TrackerConfig
-from pred_core.track.workspace import Workspace
-from pred_core.types import Box
+from pred_core.track.settings import TrackerSettings, make_tracker, parse_cameras, parse_fixtures
+from pred_core.track.tracker import HEARD, Tracker
 from pred_ros import convert, qos, shell
 from pred_ros.camera_pairs import CameraPairs
 from pred_ros.diagnostics import ERROR, OK, WARN
@@ -44,92 +39,16 @@ from pred_ros.shell import REFUSAL_SHOWN, Shell
 
 SILENT = 1.0  # [s] without a picture before a camera counts as dead
 WAITING = "waiting"
-PREFIX = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")  # of topics' names
 GAP, GAP_TIMES = 0.25, 2.5  # [s], usual times between pictures: a longer silence of all cameras is said afterwards
 
 
 @dataclass(frozen=True)
-class TrackerNodeConfig:
-    """Parameters of the tracker."""
+class TrackerNodeConfig(TrackerSettings):
+    """Parameters of the tracker: its settings (pred_core/track/settings.py), and what only the node has."""
 
-    cameras: str = setting("cam0 cam1 cam2 cam3", doc="prefixes of the cameras' topics, 1 to 8")
-    kind: str = setting("line", choices=("line", "sheet", "volume"), doc="geometry class of the object")
-    x_low: float = setting(-0.6, unit="m", low=-10.0, high=10.0, doc="workspace in world")
-    x_high: float = setting(0.6, unit="m", low=-10.0, high=10.0)
-    y_low: float = setting(-0.6, unit="m", low=-10.0, high=10.0)
-    y_high: float = setting(0.6, unit="m", low=-10.0, high=10.0)
-    z_low: float = setting(0.0, unit="m", low=-10.0, high=10.0)
-    z_high: float = setting(1.0, unit="m", low=-10.0, high=10.0)
-    table: float = setting(0.0, unit="m", low=-10.0, high=10.0, doc="height of the table's top")
-    fixtures: str = setting("", doc="boxes to ignore: 'x y z hx hy hz; ...' centre and half size [m]")
-    length: float = setting(0.0, unit="m", low=0.0, high=20.0, doc="of a line; 0: measured when it is found")
-    radius: float = setting(0.0, unit="m", low=0.0, high=0.1, doc="of a line; 0: measured when it is found")
-    particles: int = setting(61, low=4, high=5000, doc="of the object")
-    arm_radius: float = setting(0.0, unit="m", low=0.0, high=0.3, doc="of the arm above each gripper; 0: none in view")
-    arm_start: float = setting(0.05, unit="m", low=-0.5, high=0.5, doc="of it, along the gripper's +z")
-    arm_end: float = setting(0.4, unit="m", low=-0.5, high=2.0, doc="of it, along the gripper's +z")
-    masks: str = setting("", doc="folder with SAM 2, which follows the object's masks; empty: masks without weights")
-    detector: str = setting("", doc="folder with Grounding DINO, which finds the object for `masks`")
-    object: str = setting("", doc="what `detector` looks for, e.g. white rope")
     prior: bool = setting(False, doc="use state/points of the predictor as motion prior")
     prior_sigma: float = setting(0.01, unit="m", low=1e-3, high=0.5, doc="standard deviation of the prior")
-    patience: float = setting(0.03, unit="s", low=0.0, high=1.0, doc="wait for the other cameras after the first")
     autostart: bool = setting(True, doc="configure and activate without a lifecycle manager")
-
-
-def core_config(config: TrackerNodeConfig) -> TrackerConfig:
-    """The core's configuration."""
-    low, high = (config.x_low, config.y_low, config.z_low), (config.x_high, config.y_high, config.z_high)
-    return TrackerConfig(
-        kind=config.kind,
-        arm_radius=config.arm_radius,
-        arm_start=config.arm_start,
-        arm_end=config.arm_end,
-        workspace=Workspace(low, high, config.table),
-        line=LineConfig(length=config.length, radius=config.radius, particles=config.particles),
-        surface=SurfaceConfig(particles=config.particles),
-    )
-
-
-def learned_masks(config: TrackerNodeConfig) -> Masks | None:
-    """The learned masks that are asked for. Raises: ConfigError without weights, packages or a name."""
-    if not config.masks and not config.detector:
-        return None
-    from pred_core.track.learned_masks import load_named_object  # torch: seconds, which nobody else here needs
-
-    return load_named_object(config.object, Path(config.detector), Path(config.masks))
-
-
-def parse_cameras(text: str) -> list[str]:
-    """'cam0, cam1' -> ['cam0', 'cam1']. Raises: ConfigError for none, too many, a repeated or an impossible one."""
-    names = text.replace(",", " ").split()
-    fine = all(PREFIX.fullmatch(name) for name in names)
-    if not fine or not 1 <= len(set(names)) == len(names) <= MOST_CAMERAS:
-        raise ConfigError(
-            "parameter 'cameras'",
-            got=repr(text),
-            allowed=f"1 to {MOST_CAMERAS} different prefixes of topics: letters, digits, _ and /, no digit first",
-            next_step="-p cameras:='cam0 cam1'",
-        )
-    return names
-
-
-def parse_fixtures(text: str) -> tuple[Box, ...]:
-    """'x y z hx hy hz; ...' -> boxes. Raises: ConfigError."""
-    boxes = []
-    for item in filter(str.strip, text.split(";")):
-        try:
-            x, y, z, a, b, c = (float(v) for v in item.replace(",", " ").split())
-        except ValueError as error:
-            raise ConfigError(
-                "parameter 'fixtures'", got=repr(item), allowed="six numbers a box: x y z hx hy hz"
-            ) from error
-        if not (np.isfinite((x, y, z)).all() and 0.0 < min(a, b, c) <= max(a, b, c) < np.inf):
-            raise ConfigError(
-                "parameter 'fixtures'", got=repr(item), allowed="a finite centre and half sizes above 0 [m]"
-            )
-        boxes.append(Box((x, y, z), (a, b, c)))
-    return tuple(boxes)
 
 
 class TrackerNode(Shell):
@@ -160,8 +79,7 @@ class TrackerNode(Shell):
         """Check the parameters, build the tracker."""
         config: TrackerNodeConfig = self.config
         self._names = parse_cameras(config.cameras)
-        self._tracker = Tracker(core_config(config), self._names, learned_masks(config))
-        self._tracker.fixtures = parse_fixtures(config.fixtures)
+        self._tracker = make_tracker(config)
         self._out = self.create_publisher(PointCloud2, TRACKER_POINTS, qos.points_complete())
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.report(WARN, f"waiting for pictures of {', '.join(self._names)}")

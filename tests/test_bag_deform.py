@@ -112,7 +112,7 @@ def test_an_interrupted_conversion_goes_on(tmp_path: Path) -> None:
 def test_a_folder_of_another_source_is_left_alone(tmp_path: Path) -> None:
     convert_deform(read_deform(_npz(tmp_path / "x.npz")), tmp_path / "out", _quiet)
     other = read_deform(_npz(tmp_path / "y.npz", recording_id=np.array([0, 1, 2, 3])))
-    with pytest.raises(DatasetError, match="holds the conversion of another source"):
+    with pytest.raises(DatasetError, match="holds the data of another source"):
         convert_deform(other, tmp_path / "out", _quiet)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")

@@ -30,6 +30,7 @@ from pred_core.arm.protocol import SetPoint
 from pred_core.bag import images
 from pred_core.bag.clouds import read_tracker_points
 from pred_core.bag.grippers import PoseFrame, make_gripper_closed, make_gripper_pose
+from pred_core.bag.playlist import find_clips
 from pred_core.bag.wire import stamp_of
 from pred_core.bag.writer import BagWriter
 from pred_core.errors import BagError, InputError
@@ -42,7 +43,6 @@ from pred_ros.diagnostics import ERROR, WARN
 from pred_ros.paced_worker import PacedWorker
 from pred_ros.plant_node import PlantNode
 from pred_ros.player_node import PlayerNode
-from pred_ros.playlist import find_clips
 
 CAMERA_SAMPLE = Path(__file__).parents[1] / "bags" / "sample_cameras.mcap"
 

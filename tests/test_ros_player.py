@@ -24,12 +24,12 @@ from std_srvs.srv import SetBool
 from pred_core.bag.clouds import make_tracker_points
 from pred_core.bag.dataset import load_dataset
 from pred_core.bag.grippers import make_gripper_closed, make_gripper_pose
+from pred_core.bag.playlist import find_clips, stream
 from pred_core.bag.wire import stamp_of
 from pred_core.bag.writer import BagWriter
 from pred_core.live import marks
 from pred_ros import convert, qos
 from pred_ros.player_node import PlayerNode, unacknowledged
-from pred_ros.playlist import find_clips, stream
 
 SAMPLE = Path(__file__).parents[1] / "bags" / "sample_cable"
 

@@ -32,6 +32,7 @@ from pred_ros.processes import Children, free_domain, node_command, node_environ
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "bags" / "sample_cable"
+CAMERAS = ROOT / "bags" / "sample_cameras.mcap"
 HELD = "0:0 1:0 10:1 11:1"
 
 
@@ -177,6 +178,19 @@ def test_measured_data_come_first_and_the_sample_last(tmp_path: Path, monkeypatc
     assert sample.path == SAMPLE and "synthetic" in sample.origin
     assert main_job.prepare_dataset(sample, tmp_path / "unused") == SAMPLE
     assert main_job.episode_names(SAMPLE, "test", 1) == ("ep004",)
+
+
+def test_pictures_are_tracked_predicted_and_scored(tmp_path: Path) -> None:
+    """The bundled bag of cameras: tracks of every instant, and a prediction for each after the two it starts from."""
+    assert main_job.main(["--cameras", "--live-only", "--factor", "0.5", "--out", str(tmp_path)]) == 0
+    live = json.loads((tmp_path / "sample_cameras" / "live" / "metrics.json").read_text())
+    assert live["frames"] == {"announced": 25, "lost": 0}
+    mean = live["entries"][0]["metrics"]["mde"]["all_steps"]["mean"]
+    assert mean < 0.005, "a rope in motion"  # 2.0 mm; standing still would be 11.4 mm off
+    again = main_job.choose_source(tmp_path / "datasets" / "sample_cameras")
+    assert (again.name, again.pictures) == ("rope", False)
+    given = main_job.choose_source(CAMERAS)
+    assert (given.name, given.pictures) == ("sample_cameras", True)
 
 
 def test_the_command_line_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

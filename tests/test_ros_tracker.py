@@ -28,9 +28,10 @@ from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
 from pred_core.errors import ConfigError
+from pred_core.track.settings import parse_cameras, parse_fixtures
 from pred_core.types import CameraFrame
 from pred_ros import convert, qos, tracker_node
-from pred_ros.tracker_node import TrackerNode, parse_cameras, parse_fixtures
+from pred_ros.tracker_node import TrackerNode
 
 ERROR, WARN, OK = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
 START = 5_000_000_000  # [ns]

@@ -169,7 +169,7 @@ def claim_folder(root: Path, source: dict[str, object]) -> None:
             partial.unlink()
         if not path.exists():
             if any(root.iterdir()):
-                raise DatasetError(f"{root}: not empty and not made by 'pred convert'", next_step="Use a new folder")
+                raise DatasetError(f"{root}: not empty, and not begun by this command", next_step="Use a new folder")
             partial = root / f".{SOURCE_FILE}.part"
             partial.write_text(json.dumps(source, indent=2) + "\n", encoding="utf-8")
             partial.replace(path)
@@ -177,10 +177,12 @@ def claim_folder(root: Path, source: dict[str, object]) -> None:
     except (OSError, json.JSONDecodeError, UnicodeDecodeError) as error:
         raise DatasetError(f"{root}: cannot be used as a data set folder", got=error) from error
     if found != source:
+        theirs = found if isinstance(found, dict) else {}
+        differ = [k for k in (*source, *theirs) if theirs.get(k) != source.get(k)]
         raise DatasetError(
-            f"{root}: holds the conversion of another source",
-            got=json.dumps(found),
-            allowed=json.dumps(source),
+            f"{root}: holds the data of another source or other settings",
+            got=", ".join(f"{k} {json.dumps(theirs.get(k))}" for k in dict.fromkeys(differ)),
+            allowed=", ".join(f"{k} {json.dumps(source.get(k))}" for k in dict.fromkeys(differ)),
             next_step=f"Use a new folder or remove {FILE}, {SOURCE_FILE} and the bags",
         )
 

@@ -70,10 +70,12 @@ def _dataset_lines(s: DatasetSummary) -> list[str]:
             f"{len(s.shared_recordings)} recordings have episodes in train and in test: this split leaks, "
             "compare with folds grouped by recording"
         )
-    lines += ["", f"{'episode':<14}{'split':<7}{'rec':>4}{'frames':>8}{'stretch':>9}{'m/s':>6}{'hidden':>8}  data gate"]
+    width = max([14, *(len(q.name) + 1 for q in s.episodes)])
+    columns = f"{'split':<7}{'rec':>4}{'frames':>8}{'stretch':>9}{'m/s':>6}{'hidden':>8}  data gate"
+    lines += ["", f"{'episode':<{width}}{columns}"]
     for q in s.episodes:
         lines.append(
-            f"{q.name:<14}{q.split:<7}{q.recording:>4}{q.frames:>8}{q.stretch_max:>9.1%}{q.speed_max:>6.1f}"
+            f"{q.name:<{width}}{q.split:<7}{q.recording:>4}{q.frames:>8}{q.stretch_max:>9.1%}{q.speed_max:>6.1f}"
             f"{q.hidden:>8.1%}  {'; '.join(q.flags) or '-'}"
         )
     flagged = sum(bool(q.flags) for q in s.episodes)

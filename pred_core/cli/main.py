@@ -10,7 +10,7 @@ from types import ModuleType
 
 from pred_core.errors import PredError, nearest
 
-COMMANDS: tuple[str, ...] = ("info", "convert", "identify", "train", "diagnose", "evaluate", "plan", "plant")
+COMMANDS: tuple[str, ...] = ("info", "convert", "track", "identify", "train", "diagnose", "evaluate", "plan", "plant")
 INTERRUPTED = 130  # the shell's code for SIGINT
 BAD_INPUT = 2
 _INTERRUPTED = "run the same command again to go on where it stopped"

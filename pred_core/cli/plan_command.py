@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pred_core.bag.dataset import FILE
+from pred_core.cli.settings import parse_held
 from pred_core.config import check_ranges
 from pred_core.errors import ConfigError, InputError
 from pred_core.plan.config import PlannerConfig
@@ -116,15 +117,3 @@ def _goal(args: argparse.Namespace, seen: Observation) -> Array:
     else:
         goal = read_cloud(args.goal)
     return goal if args.shift is None else np.asarray(goal + np.array(args.shift))
-
-
-def parse_held(text: str) -> dict[int, int]:
-    """'0:0 11:1' -> {0: 0, 11: 1}. Raises: ConfigError."""
-    try:
-        pairs = [tuple(int(x) for x in item.split(":")) for item in text.replace(",", " ").split()]
-        held = {particle: gripper for particle, gripper in pairs}
-    except ValueError as error:
-        raise ConfigError("--held", got=repr(text), allowed="pairs like '0:0 1:0'") from error
-    if not held or any(p < 0 or g < 0 for p, g in held.items()):
-        raise ConfigError("--held", got=repr(text), allowed="ids and gripper indices of 0 or more")
-    return held

@@ -7,6 +7,7 @@ import dataclasses
 from typing import Any, get_type_hints
 
 from pred_core.config import from_mapping
+from pred_core.errors import ConfigError
 
 
 def add_settings(parser: argparse.ArgumentParser, config: type) -> None:
@@ -43,6 +44,18 @@ def given_settings(args: argparse.Namespace, config: type) -> list[str]:
         elif given is not None:
             flags += [flag, str(given)]
     return flags
+
+
+def parse_held(text: str) -> dict[int, int]:
+    """'0:0 11:1' -> {0: 0, 11: 1}. Raises: ConfigError."""
+    try:
+        pairs = [tuple(int(x) for x in item.split(":")) for item in text.replace(",", " ").split()]
+        held = {particle: gripper for particle, gripper in pairs}
+    except ValueError as error:
+        raise ConfigError("--held", got=repr(text), allowed="pairs like '0:0 1:0'") from error
+    if not held or any(p < 0 or g < 0 for p, g in held.items()):
+        raise ConfigError("--held", got=repr(text), allowed="ids and gripper indices of 0 or more")
+    return held
 
 
 def shown(value: Any) -> str:

@@ -13,9 +13,9 @@ from pred_core.plant.live.station import Station
 from pred_core.plant.live.teleop import TeleopConfig, draw_route
 
 SEED = 11
-RATE = 5.0  # [Hz] of each camera
-SECONDS = 2.8
-SLOWLY = TeleopConfig(slow=0.1, fast=0.12)  # m/s: at 5 Hz the rope moves 2.4 cm between pictures
+RATE = 15.0  # [Hz] of each camera, as the twins of the cell step
+SECONDS = 1.6
+SLOWLY = TeleopConfig(slow=0.2, fast=0.25)  # m/s
 KEPT = Keeping(quality=60, farthest=1.05)
 
 
