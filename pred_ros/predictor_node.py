@@ -38,7 +38,7 @@ from pred_ros import convert, qos, shell
 from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.shell import Shell
 
-KEPT = 8  # newest messages that survive an overload: four frames with their poses, enough for a start
+KEPT = 8  # newest messages that survive an overload
 COUNTS_SHOWN = ("runs", "steps", "interpolated", "unused_poses", "gaps", "jumps", "dropped_frames", "dropped_poses")
 OVERLOAD_SHOWN = 5.0  # [s] how long dropped messages do
 
@@ -63,7 +63,7 @@ class PredictorConfig:
     overload: str = setting(
         "newest", choices=("newest", "queue"), doc="when too slow: restart at newest data, or keep all"
     )
-    max_backlog: float = setting(0.5, unit="s", low=0.01, high=60.0, doc="backlog that counts as too slow")
+    max_backlog: float = setting(0.5, unit="s", low=0.01, high=60.0, doc="wait of a message that counts as too slow")
     wait_for: int = setting(0, low=0, high=64, doc="readers of prediction/points to wait for before subscribing")
     threads: int = setting(1, low=1, high=64, doc="torch threads")
     autostart: bool = setting(True, doc="configure and activate without a lifecycle manager")
@@ -104,7 +104,8 @@ class PredictorNode(Shell):
 
     def __init__(self) -> None:
         super().__init__()
-        self._inbox: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._inbox: queue.SimpleQueue[tuple[float, Callable[[], None]] | None] = queue.SimpleQueue()
+        self._waited = 0.0  # [s] the message that is worked on, from its arrival
         self._worker: Future[None] | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="prediction")
         self._inputs: list[Subscription] = []
@@ -246,7 +247,7 @@ class PredictorNode(Shell):
         self._closed = closed
 
     def _post(self, action: Callable[..., None], *values: object) -> None:
-        self._inbox.put(lambda: action(*values))
+        self._inbox.put((self.seconds(), lambda: action(*values)))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._post(self._reset)
@@ -256,7 +257,9 @@ class PredictorNode(Shell):
     # Below: the worker thread. It alone touches the Predictor's state.
 
     def _work(self) -> None:
-        while not self._stopping and (action := self._inbox.get()) is not None:
+        while not self._stopping and (item := self._inbox.get()) is not None:
+            arrived, action = item
+            self._waited = self.seconds() - arrived
             try:
                 with torch.no_grad():
                     action()
@@ -280,10 +283,8 @@ class PredictorNode(Shell):
         if closed is None:
             self.diagnostics.count("poses before the first gripper/closed")
             return
-        if (
-            self.config.overload == "newest"
-            and self._inbox.qsize() * self._dynamics.period > 2 * self.config.max_backlog
-        ):
+        late = self._waited > self.config.max_backlog and self._inbox.qsize() > KEPT
+        if self.config.overload == "newest" and late:
             self._drop_to_newest()
         self._predictor.add_pose(pose, closed)
         self._advance()

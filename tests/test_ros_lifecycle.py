@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,9 +12,12 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from live_world import START, STEP
+from live_world import CLOSED, START, STEP, pose
 from predictor_bench import SlowPredictor, predictor_bench
 from ros_bench import Bench
+
+from pred_core.bag.wire import GRIPPER_POSE
+from pred_ros import convert
 
 WARN = DiagnosticStatus.WARN
 
@@ -51,6 +55,20 @@ def test_too_slow_drops_to_the_newest_data_and_says_so(straight_twin: Path) -> N
         bench.node.diagnostics._clock = lambda: clock
         bench.node.heartbeat()
         assert "too slow" not in bench.node.diagnostics.message, "six seconds later it does not"
+
+
+def test_many_poses_at_once_are_no_overload(straight_twin: Path) -> None:
+    """An arm may say where it is ten times a period: what counts is how long a message waits."""
+    with predictor_bench(straight_twin, overload="newest", max_backlog="0.5") as bench:
+        bench.until(lambda: bench.node._inputs, "the node listens")
+        bench.node._closed = CLOSED
+        count = 400  # 40 periods, which would take 0.4 s if they came as they were measured
+        for k in range(count):
+            one = dataclasses.replace(pose(0), stamp=START + k * STEP // 10)
+            bench.node._on_pose(convert.pose_to_message(one))
+        bench.until(lambda: bench.node._inbox.qsize() == 0, "all of them are taken")
+        assert bench.node.diagnostics.counter(f"messages on {GRIPPER_POSE}") == count
+        assert bench.node.diagnostics.counter("dropped messages") == 0
 
 
 def test_queue_keeps_every_message_however_slow(straight_twin: Path) -> None:

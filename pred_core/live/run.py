@@ -75,13 +75,6 @@ class Run:
         """True once a run has started and not ended."""
         return self._state is not None
 
-    @property
-    def backlog(self) -> float:
-        """[s] of poses that wait to be stepped over."""
-        if not self.running or not self._poses or self._poses[-1].lap != self._time[0]:
-            return len(self._poses) * self._dynamics.period if self.running else 0.0
-        return (self._poses[-1].pose.stamp - self._time[1]) * 1e-9
-
     def waiting(self) -> str:
         """What a start lacks."""
         if self.counts.waiting_for:
