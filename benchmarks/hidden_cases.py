@@ -7,6 +7,7 @@ and magnitudes.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,8 @@ from pred_core.plant.rope_case import Hidden, write_rope_case
 from pred_core.plant.session import SessionConfig
 
 SESSION = SessionConfig(train=12, test=4, ood=3, seconds=4.0)
-SETS = ("final", "seen", "dev")
+SETS = ("final", "seen", "dev", "extents")
+SIZED = ("attraction", "sticky_patch", "gripper_slip", "heavy_tip", "stiff_region")  # their size starts a search too
 REFERENCES = (50000, 51000, 52000, 53000)
 SEEN = (29, 106, 34, 64, 78, 102)  # cases of each seen draw that were looked at
 LEAST, MOST = 2.0, 10.0  # magnitudes, in multiples of the effect's declared minimum, log-uniform
@@ -32,6 +34,7 @@ class Case:
     seed: int
     hidden: Hidden
     reference: str  # name of the reference it is diagnosed with
+    extent: float = 1.0  # times the usual size in space of what is hidden
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,8 @@ def _release(references: tuple[int, ...], drawn: list[tuple[int, Hidden]]) -> Re
 
 
 def release(which: str) -> Release:
-    """One of SETS. "dev": chose what is frozen; "seen": looked at since; "final": what is reported."""
+    """One of SETS. "dev": chose what is frozen; "seen": looked at since; "final": what is reported; "extents": what
+    has a size, smaller and larger than where a search for it begins."""
     if which == "dev":
         return _release((7000,), cases(7100, 1, 8, 26, 7, 4))
     if which == "seen":
@@ -86,10 +90,16 @@ def release(which: str) -> Release:
         drawn = [cases(begin, seed, controls, controls + 6, 10, 6) for begin, seed, controls in first]
         parts = [_release(REFERENCES, d[:count]) for d, count in zip(drawn, SEEN, strict=True)]
         return Release(parts[0].references, tuple(c for p in parts for c in p.cases))
+    if which == "extents":
+        factors = np.exp(np.random.default_rng(9).uniform(np.log(4.0), np.log(MOST), len(SIZED)))
+        both = [(n, LIBRARY[n].minimum * float(f), e) for n, f in zip(SIZED, factors, strict=True) for e in (0.6, 1.6)]
+        sized = _release(REFERENCES, [(51801 + k, ((n, m),)) for k, (n, m, _) in enumerate(both)])
+        found = (dataclasses.replace(c, extent=e) for c, (_, _, e) in zip(sized.cases, both, strict=True))
+        return Release(sized.references, tuple(found))
     return _release(REFERENCES, cases(51600, 8, 40, 46, 10, 6))
 
 
-def simulate(root: Path, hidden: Hidden, seed: int) -> None:
+def simulate(root: Path, hidden: Hidden, seed: int, extent: float = 1.0) -> None:
     """Write the data set, unless it is finished."""
     if not (root / "dataset.yaml").exists():
-        write_rope_case(root, hidden, seed, lambda done, total, name: None, session=SESSION)
+        write_rope_case(root, hidden, seed, lambda done, total, name: None, session=SESSION, extent=extent)

@@ -155,7 +155,7 @@ def _identify(work: Path, seeds: Mapping[str, int], name: str) -> int:
 
 def _diagnose(args: argparse.Namespace, cases: Mapping[str, Case], name: str) -> int:
     case, work, out = cases[name], args.work, args.work / args.out / name
-    simulate(work / case.name, case.hidden, case.seed)
+    simulate(work / case.name, case.hidden, case.seed, case.extent)
     out.mkdir(parents=True, exist_ok=True)
     (out / CODE).write_text(_code() + "\n", encoding="utf-8")
     program = [str(HERE / "hidden_placebos.py")] if args.placebos else PRED

@@ -150,6 +150,20 @@ def test_what_a_law_remembers_is_carried_over_restarts(twin: Twin) -> None:
     assert float(forgot.abs().max()) > 20.0 * float(carried.abs().max())
 
 
+def test_a_law_that_remembers_works_on_some_of_the_windows(twin: Twin) -> None:
+    """A search looks at a few windows of long episodes: those between them are missing in every episode."""
+    stiff, creep = remembering(twin)
+    sample = make_sample(recorded(stiff, creep, ("train",) * 2, frames=40, size=0.12), stiff, 0.3)
+    assert int(sample.order.max()) >= 3
+    candidate = [Candidate(stiff.physics, creep)]
+    whole = Roller(stiff, sample).errors(candidate)[0]
+    begin, ends = (np.flatnonzero(np.isin(sample.order, orders)) for orders in ([0], [0, 3]))
+    some = Roller(stiff, sample.some(ends)).errors(candidate)[0]
+    assert some.shape == (len(ends), *whole.shape[1:]) and bool(torch.isfinite(some).all())
+    at_begin = torch.as_tensor(np.flatnonzero(np.isin(ends, begin)))
+    assert torch.equal(some[at_begin], whole[torch.as_tensor(begin)])
+
+
 def test_a_slide_is_counted_once(twin: Twin) -> None:
     """The rope slides out by centimetres in 1.3 s. Each window starts from a measured rope that has slid already, so a
     slide begins anew there, also beside creep that is off, for whose sake memory is carried from window to window.

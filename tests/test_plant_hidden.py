@@ -242,3 +242,16 @@ def test_places_are_drawn_from_the_seed() -> None:
         leans.append(world.model.opt.gravity.copy())
     assert np.array_equal(leans[0], leans[1]) and np.abs(leans[2] - leans[0]).max() > 0.1
     assert mujoco.mj_versionString() == "4.0.0"
+
+
+@pytest.mark.parametrize("name", ["attraction", "sticky_patch", "gripper_slip", "heavy_tip", "stiff_region"])
+def test_an_effect_of_another_extent_moves_the_rope_otherwise(name: str) -> None:
+    """What has a size in space: at its usual size bit for bit what it was, at another one something else."""
+    regime = "table" if name == "sticky_patch" else "air"
+    hidden, motion = ((name, 5.0 * LIBRARY[name].minimum),), plan(regime)
+    usual, same = (simulate_rope(motion, hidden, 5, 0.8, 30, **e)[0].position for e in ({}, {"extent": 1.0}))
+    other = simulate_rope(motion, hidden, 5, 0.8, 30, extent=1.6)[0].position
+    assert np.array_equal(usual, same)
+    assert np.abs(usual - other).max() > 1e-4  # [m]
+    with pytest.raises(ConfigError, match="extent"):
+        make_effect(name, hidden[0][1], 0, extent=3.0)

@@ -29,6 +29,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     rope.add_argument("--effect", action="append", metavar="NAME", help="what is hidden; may be given twice; or none")
     about = "one an effect, in its unit; without, its least"
     rope.add_argument("--magnitude", action="append", type=float, metavar="M", help=about)
+    about = "times the usual size of what is hidden: a range, a radius, a share of the rope (default: 1)"
+    rope.add_argument("--extent", type=float, default=1.0, metavar="X", help=about)
     springs = worlds.add_parser("springs", help="springs like those of our simulator, finer: nothing is hidden")
     for world in (rope, springs):
         world.add_argument("--seed", type=int, default=0, help="motions, noise, directions and places")
@@ -76,7 +78,9 @@ def _rope(args: argparse.Namespace) -> int:
 
     session, sensor = _settings(args)
     hidden = hidden_effects(args.effect or [], args.magnitude or [])
-    return _report(write_rope_case(args.out, hidden, args.seed, progress_line(), session=session, sensor=sensor))
+    return _report(write_rope_case(
+            args.out, hidden, args.seed, progress_line(), session=session, sensor=sensor, extent=args.extent
+        ))
 
 
 def _springs(args: argparse.Namespace) -> int:

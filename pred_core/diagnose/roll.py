@@ -91,10 +91,10 @@ class Roller:
         """(K, C, W, N, 3), windows in the sample's order."""
         effects = [find_effect(e.id) for e in candidates[0].extensions]
         remembers = any(e.bend_memory for e in effects)
-        orders = int(self.sample.order.max()) + 1 if remembers else 1
+        orders = np.unique(self.sample.order).tolist() if remembers else [0]  # of some windows, not all are there
         result: Tensor | None = None
         memory: dict[int, Tensor] = {}  # episode -> (C, M + 1) what the laws remember, and steps
-        for order in range(orders):
+        for order in orders:
             every = np.arange(self.sample.windows.count, dtype=np.int64)
             keep = np.flatnonzero(self.sample.order == order).astype(np.int64) if remembers else every
             part, left = self._call(candidates, substeps, keep, memory)

@@ -1,91 +1,66 @@
-"""The library of causes. Adding one is one file and one line in `LIBRARY`."""
+"""The library of causes. Adding one is one file `ID.py` with its `Effect` here, and its id as one line in `IDS`."""
 
 from __future__ import annotations
 
-from pred_core.effects.attraction import Attraction
-from pred_core.effects.bending_creep import BendingCreep
-from pred_core.effects.bending_damping import BendingDamping
-from pred_core.effects.bending_gradient import BendingGradient
-from pred_core.effects.bending_hysteresis import BendingHysteresis
-from pred_core.effects.bending_plasticity import BendingPlasticity
-from pred_core.effects.bending_profile import BendingProfile
-from pred_core.effects.bending_region import BendingRegion
-from pred_core.effects.bending_scale import BendingScale
-from pred_core.effects.bending_stiffening import BendingStiffening
-from pred_core.effects.camera_rotation import CameraRotation
-from pred_core.effects.camera_scale import CameraScale
-from pred_core.effects.delay import Delay
-from pred_core.effects.drag_linear import DragLinear
-from pred_core.effects.drag_quadratic import DragQuadratic
+import importlib
+
 from pred_core.effects.effect import Effect
-from pred_core.effects.friction_anisotropic import FrictionAnisotropic
-from pred_core.effects.friction_drift import FrictionDrift
-from pred_core.effects.friction_patch import FrictionPatch
-from pred_core.effects.friction_scale import FrictionScale
-from pred_core.effects.friction_viscous import FrictionViscous
-from pred_core.effects.gravity_offset import GravityOffset
-from pred_core.effects.grip_slip import GripSlip
-from pred_core.effects.gripper_offset import GripperOffset
-from pred_core.effects.gripper_rotation import GripperRotation
-from pred_core.effects.length_drift import LengthDrift
-from pred_core.effects.length_scale import LengthScale
-from pred_core.effects.mass_gradient import MassGradient
-from pred_core.effects.mass_profile import MassProfile
-from pred_core.effects.obstacle import Obstacle
-from pred_core.effects.rest_bow import RestBow
-from pred_core.effects.rest_curvature import RestCurvature
-from pred_core.effects.stiffness_drift import StiffnessDrift
-from pred_core.effects.strain_stiffening import StrainStiffening
-from pred_core.effects.stretch_scale import StretchScale
-from pred_core.effects.table_height import TableHeight
-from pred_core.effects.table_tilt import TableTilt
-from pred_core.effects.tether import Tether
-from pred_core.effects.tip_mass import TipMass
-from pred_core.effects.wind import Wind
 from pred_core.errors import TwinError, nearest
 
-_ALL: tuple[type[Effect], ...] = (
-    DragLinear,
-    DragQuadratic,
-    GravityOffset,
-    BendingDamping,
-    BendingHysteresis,
-    RestCurvature,
-    BendingProfile,
-    MassProfile,
-    Wind,
-    Attraction,
-    Tether,
-    Obstacle,
-    FrictionScale,
-    FrictionViscous,
-    FrictionAnisotropic,
-    FrictionPatch,
-    TableHeight,
-    TipMass,
-    MassGradient,
-    BendingScale,
-    BendingRegion,
-    FrictionDrift,
-    TableTilt,
-    BendingGradient,
-    StrainStiffening,
-    StretchScale,
-    LengthDrift,
-    LengthScale,
-    StiffnessDrift,
-    BendingCreep,
-    RestBow,
-    BendingStiffening,
-    BendingPlasticity,
-    GripperOffset,
-    GripperRotation,
-    GripSlip,
-    Delay,
-    CameraScale,
-    CameraRotation,
+# In this order they are listed and tried.
+IDS = (
+    "drag_linear",
+    "drag_quadratic",
+    "gravity_offset",
+    "bending_damping",
+    "bending_hysteresis",
+    "rest_curvature",
+    "bending_profile",
+    "mass_profile",
+    "wind",
+    "attraction",
+    "tether",
+    "obstacle",
+    "friction_scale",
+    "friction_viscous",
+    "friction_anisotropic",
+    "friction_patch",
+    "table_height",
+    "tip_mass",
+    "mass_gradient",
+    "bending_scale",
+    "bending_region",
+    "friction_drift",
+    "table_tilt",
+    "bending_gradient",
+    "strain_stiffening",
+    "stretch_scale",
+    "length_drift",
+    "length_scale",
+    "stiffness_drift",
+    "bending_creep",
+    "rest_bow",
+    "bending_stiffening",
+    "bending_plasticity",
+    "gripper_offset",
+    "gripper_rotation",
+    "grip_slip",
+    "delay",
+    "camera_scale",
+    "camera_rotation",
 )
-LIBRARY: dict[str, type[Effect]] = {e.id: e for e in _ALL}
+
+
+def _load(id: str) -> type[Effect]:
+    """The effect that the module of this name defines."""
+    module = importlib.import_module(f"{__name__}.{id}")
+    (effect,) = (v for v in vars(module).values() if isinstance(v, type) and v.__module__ == module.__name__
+                 and issubclass(v, Effect))  # fmt: skip
+    assert effect.id == id, f"{module.__name__} defines '{effect.id}'"
+    return effect
+
+
+LIBRARY: dict[str, type[Effect]] = {id: _load(id) for id in IDS}
 
 
 def find_effect(id: str) -> type[Effect]:

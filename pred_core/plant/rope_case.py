@@ -12,7 +12,7 @@ from pred_core.config import to_mapping
 from pred_core.errors import ConfigError, DivergenceError
 from pred_core.plant.case import Progress, write_case
 from pred_core.plant.hidden.effect import HiddenEffect
-from pred_core.plant.hidden.library import check_magnitude, find_entry, make_effect
+from pred_core.plant.hidden.library import check_extent, check_magnitude, find_entry, make_effect
 from pred_core.plant.rope import RopeConfig, build_rope
 from pred_core.plant.sensing import SensorConfig
 from pred_core.plant.session import EpisodePlan, SessionConfig
@@ -20,6 +20,7 @@ from pred_core.plant.world import Record, World, run_episode
 
 Hidden = tuple[tuple[str, float], ...]  # effect name, magnitude
 PARTS = (1, 2, 4, 8)  # MuJoCo's steps in a `STEP`, one after the other until one holds
+BEYOND = 1.15  # clamped lengths: how far from the end the second particle may be and count as held
 BLOCKED = 1e-3  # [m] off its reference; the drive alone stays within a tenth of it
 
 
@@ -32,20 +33,30 @@ def write_rope_case(
     session: SessionConfig | None = None,
     sensor: SensorConfig | None = None,
     rope: RopeConfig | None = None,
+    extent: float = 1.0,
 ) -> Dataset:
     """Write the data set of a seed with the hidden effects in it. Finished bags of the same case are kept.
 
+    extent: times the effects' usual size in space (`make_effect`).
     Raises: ConfigError for an unknown effect or a magnitude out of range; DatasetError if `root` holds something else.
     """
     session, sensor, rope = session or SessionConfig(), sensor or SensorConfig(), rope or RopeConfig()
+    check_extent(extent)
     for name, magnitude in hidden:
         check_magnitude(find_entry(name), magnitude)
+    spacing, clamped = rope.length / (session.particles - 1), rope.clamped * rope.link_length
+    if spacing > BEYOND * clamped:
+        raise ConfigError(
+            "tracked particles: the second one is not in the jaws, as `held` will say",
+            got=f"{session.particles} particles, {1e3 * spacing:.0f} mm apart; {1e3 * clamped:.0f} mm are clamped",
+            allowed=f"{int(np.ceil(1 + rope.length / (BEYOND * clamped)))} or more",
+        )
     if len({name for name, _ in hidden}) != len(hidden):
         raise ConfigError("hidden effects", got=", ".join(n for n, _ in hidden), allowed="each once")
 
     def simulate(plans: Sequence[EpisodePlan]) -> Iterator[tuple[EpisodePlan, Record, Sequence[HiddenEffect]]]:
         for plan in plans:
-            record, effects = simulate_rope(plan, hidden, seed, session.seconds, session.particles, rope)
+            record, effects = simulate_rope(plan, hidden, seed, session.seconds, session.particles, rope, extent)
             yield plan, record, effects
 
     return write_case(
@@ -58,6 +69,7 @@ def write_rope_case(
             "sensor": to_mapping(sensor),
             "rope": to_mapping(rope),
             "format": 1,
+            **({"extent": extent} if extent != 1.0 else {}),
         },
         simulate=simulate,
         session=session,
@@ -69,7 +81,13 @@ def write_rope_case(
 
 
 def simulate_rope(
-    plan: EpisodePlan, hidden: Hidden, seed: int, seconds: float, particles: int, rope: RopeConfig | None = None
+    plan: EpisodePlan,
+    hidden: Hidden,
+    seed: int,
+    seconds: float,
+    particles: int,
+    rope: RopeConfig | None = None,
+    extent: float = 1.0,
 ) -> tuple[Record, tuple[HiddenEffect, ...]]:
     """One episode in MuJoCo: what happened, and the effects, fresh for this episode, that act on its measurement.
 
@@ -78,7 +96,7 @@ def simulate_rope(
     what is hidden keeps the gripper from where it is said to be.
     """
     for parts in PARTS:
-        effects = tuple(make_effect(name, magnitude, seed, place) for place, (name, magnitude) in enumerate(hidden))
+        effects = tuple(make_effect(n, m, seed, place, extent) for place, (n, m) in enumerate(hidden))
         built = build_rope(rope or RopeConfig(), reversed=plan.motion.variant == "regrasp")
         world = World(built, effects, plan.start)
         try:

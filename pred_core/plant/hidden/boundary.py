@@ -28,7 +28,7 @@ class GripperSlip(HiddenEffect):
                 frictionloss=HELD_FAST,
                 solref_friction=FIRM_REF,
                 solimp_friction=FIRM,
-                damping=SLIP_DAMPING,
+                damping=SLIP_DAMPING * self.extent,
             )
 
     def act(self, world: World) -> None:
@@ -52,7 +52,7 @@ class GripperOffset(HiddenEffect):
 
 
 class Attraction(HiddenEffect):
-    """A force per mass towards a fixed place, strongest at 0.15 m from it."""
+    """A force per mass towards a fixed place, strongest at a distance r from it."""
 
     def begin(self, world: World) -> None:
         """Draw the place: between where ropes hang and where they lie."""
@@ -60,9 +60,9 @@ class Attraction(HiddenEffect):
 
     def act(self, world: World) -> None:
         """a (d / r) exp(1/2 - d^2 / 2 r^2) per mass."""
-        away = self._center - world.position
-        square = (away**2).sum(axis=1, keepdims=True) / ATTRACTION_RANGE**2
-        world.add_force(self.magnitude * world.mass[:, None] * away / ATTRACTION_RANGE * np.exp(0.5 - 0.5 * square))
+        away, reach = self._center - world.position, ATTRACTION_RANGE * self.extent
+        square = (away**2).sum(axis=1, keepdims=True) / reach**2
+        world.add_force(self.magnitude * world.mass[:, None] * away / reach * np.exp(0.5 - 0.5 * square))
 
 
 class Tether(HiddenEffect):
@@ -94,7 +94,7 @@ class Repulsion(HiddenEffect):
         distance = np.linalg.norm(away, axis=-1)
         count = len(p)
         apart = np.abs(np.arange(count)[:, None] - np.arange(count)[None]) > 2
-        size = np.where(apart, np.exp(-distance / REPULSION_RANGE) / np.maximum(distance, 1e-6), 0.0)
+        size = np.where(apart, np.exp(-distance / (REPULSION_RANGE * self.extent)) / np.maximum(distance, 1e-6), 0.0)
         share = world.mass[:, None] * world.mass[None] / world.mass.mean()
         world.add_force(self.magnitude * ((size * share)[..., None] * away).sum(axis=1))
 

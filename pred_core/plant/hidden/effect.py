@@ -24,6 +24,8 @@ class HiddenEffect:
     motions and noise from other generators, so they are the same for every effect of a seed.
     """
 
+    extent: float = 1.0  # times the effect's usual size in space: a range, a radius, a share of the rope
+
     def __init__(self, magnitude: float, generator: np.random.Generator):
         self.magnitude = magnitude
         self.generator = generator

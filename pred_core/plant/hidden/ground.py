@@ -76,7 +76,7 @@ class StickyPatch(LinkFriction):
     def change(self, world: World) -> Array:
         """A bell around the centre."""
         square = ((world.position[:, :2] - self._center) ** 2).sum(axis=1)
-        return self.magnitude * np.exp(-0.5 * square / PATCH_RADIUS**2)
+        return self.magnitude * np.exp(-0.5 * square / (PATCH_RADIUS * self.extent) ** 2)
 
 
 class ViscousFriction(LinkFriction):

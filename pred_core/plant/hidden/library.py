@@ -13,6 +13,7 @@ from pred_core.plant.hidden import air, boundary, ground, material, measurement
 from pred_core.plant.hidden.effect import Entry, HiddenEffect
 
 NONE = "none"
+EXTENTS = (0.4, 2.5)
 _MODULES = (air, ground, material, boundary, measurement)
 LIBRARY: Mapping[str, Entry] = MappingProxyType({e.name: e for m in _MODULES for e in m.ENTRIES})
 
@@ -34,11 +35,21 @@ def check_magnitude(entry: Entry, magnitude: float) -> None:
         )
 
 
-def make_effect(name: str, magnitude: float, seed: int, place: int = 0) -> HiddenEffect:
+def make_effect(name: str, magnitude: float, seed: int, place: int = 0, extent: float = 1.0) -> HiddenEffect:
     """The effect; directions and places come from the seed, and from its place where several are hidden.
 
+    extent: times its usual range, radius or share of the rope, and a slip's damping; others have none.
     Raises: ConfigError.
     """
     entry = find_entry(name)
     check_magnitude(entry, magnitude)
-    return entry.make(magnitude, np.random.default_rng([seed, 2, place]))
+    check_extent(extent)
+    effect = entry.make(magnitude, np.random.default_rng([seed, 2, place]))
+    effect.extent = extent
+    return effect
+
+
+def check_extent(extent: float) -> None:
+    """Raise ConfigError unless it is in EXTENTS."""
+    if not EXTENTS[0] <= extent <= EXTENTS[1]:
+        raise ConfigError("extent", got=f"{extent:g}", allowed=f"{EXTENTS[0]:g} to {EXTENTS[1]:g} times the usual")

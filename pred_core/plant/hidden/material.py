@@ -27,13 +27,14 @@ class BendingStiffness(HiddenEffect):
 
 
 class StiffRegion(BendingStiffness):
-    """Joint springs of a fifth of the rope, at a drawn place."""
+    """Joint springs of a fifth (times `extent`) of the rope, at a drawn place."""
 
     def where(self, world: World) -> Array:
         """One inside the region."""
-        begin = self.generator.uniform(0.15, 0.85 - REGION)
+        width = REGION * self.extent
+        begin = self.generator.uniform(0.15, 0.85 - width)
         s = world.rope.joint_material[world.joint_link]
-        return ((s >= begin) & (s <= begin + REGION)).astype(float)
+        return ((s >= begin) & (s <= begin + width)).astype(float)
 
 
 class StiffnessDrift(HiddenEffect):
@@ -64,11 +65,11 @@ class Mass(HiddenEffect, ABC):
 
 
 class HeavyTip(Mass):
-    """The last tenth of the rope (the end that is usually free) is heavier."""
+    """The last tenth (times `extent`) of the rope, at the end that is usually free, is heavier."""
 
     def where(self, material: Array) -> Array:
         """One at the tip."""
-        return (material > 1.0 - TIP).astype(float)
+        return (material > 1.0 - TIP * self.extent).astype(float)
 
 
 class MassGradient(Mass):
