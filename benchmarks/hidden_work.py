@@ -53,7 +53,7 @@ def check_truth(work: Path, case: Case) -> None:
     if truth is None:
         raise ConfigError(f"{case.name} cannot be scored", got=f"no {beside}", next_step=CHECK)
     hidden = tuple((h["effect"], float(h["magnitude"])) for h in truth["hidden"])
-    if hidden != case.hidden or truth["seed"] != case.seed:
+    if (hidden, truth["seed"], truth.get("extent", 1.0)) != (case.hidden, case.seed, case.extent):
         raise ConfigError(f"{beside} is of another case than {case.name}", next_step="Use another work folder")
 
 

@@ -37,7 +37,7 @@ def test_runs_go_on_and_say_what_failed(
         return 0 if words[0] == "identify" else 2
 
     monkeypatch.setattr(effects, "_pred", pred)
-    monkeypatch.setattr(effects, "simulate", lambda root, hidden, seed: None)
+    monkeypatch.setattr(effects, "simulate", lambda *_: None)
     first, second = (c.name for c in drawn.cases[:2])
     done = tmp_path / "out" / first
     done.mkdir(parents=True)
@@ -131,7 +131,7 @@ def test_each_step_is_left_out_in_turn_and_compared_on_the_same_cases(
 
     monkeypatch.setattr(effects, "_pred", pred)
     monkeypatch.setattr(effects, "_all", lambda what, names, jobs, do: [n for n in names if do(n)])
-    monkeypatch.setattr(effects, "simulate", lambda root, hidden, seed: None)
+    monkeypatch.setattr(effects, "simulate", lambda *_: None)
     one = controls[0].name
     left_by_a_run(tmp_path, controls[:1])
     monkeypatch.setattr(sys, "argv", ["x", "ablate", "--work", str(tmp_path), "--only", *(c.name for c in controls)])
