@@ -174,14 +174,14 @@ def _code() -> str:
 
 
 def _pred(words: Sequence[str], log: Path, program: Sequence[str] = PRED) -> int:
-    """Exit code of one `pred` command on one thread, its words in a log."""
+    """Exit code of one `pred` command on one thread, its words in a log. It runs the code that `_code` hashes."""
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w", encoding="utf-8") as stream:
         stream.write("pred " + shlex.join(words) + "\n")
         stream.flush()
         return subprocess.run(
             [sys.executable, *program, *words], stdout=stream, stderr=subprocess.STDOUT,
-            env={**os.environ, **ONE_THREAD}, check=False,
+            env={**os.environ, **ONE_THREAD, "PYTHONPATH": str(Path(pred_core.__file__).parents[1])}, check=False,
         ).returncode  # fmt: skip
 
 
