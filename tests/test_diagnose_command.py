@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,26 +19,34 @@ from report_cases import PERIOD, drag, recorded, rope
 from pred_core.bag.dataset import EpisodeEntry, write_dataset
 from pred_core.bag.episode import write_episode
 from pred_core.cli.main import main
+from pred_core.diagnose.journal import Journal
 from pred_core.plant.session import SessionConfig
 from pred_core.plant.springs import Line, SpringsConfig, write_springs_case
 from pred_core.pred import load_dynamics
 from pred_core.springmass import build_body
 from pred_core.twin import Twin, TwinMeta
-from pred_core.types import Array, Episode, ObjectInfo, Physics, Scene, State
+from pred_core.types import STANDARD_GRAVITY, Array, Episode, ObjectInfo, Physics, Scene, State
 
 SPLITS = ("train",) * 5 + ("test",)
 FAST = ["--places", "4", "--survivors", "3", "--iterations", "6"]
 
 
-def write(root: Path, episodes: Sequence[Episode], rate: float = 30.0, name: str = "rope") -> Path:
+def write(
+    root: Path,
+    episodes: Sequence[Episode],
+    rate: float = 30.0,
+    name: str = "rope",
+    gravity: tuple[float, float, float] = STANDARD_GRAVITY,
+) -> Path:
     """The episodes as a data set of bags."""
     entries = []
     for e in episodes:
         write_episode(root / f"{e.name}.mcap", e)
         entries.append(EpisodeEntry(f"{e.name}.mcap", e.split, e.recording))
     write_dataset(
-        root, object=ObjectInfo(name, "line"), rate=rate, entries=entries, held={0: 0}, known={"mass": 0.05}
-    )
+        root, object=ObjectInfo(name, "line"), rate=rate, entries=entries, held={0: 0}, known={"mass": 0.05},
+        gravity=gravity,
+    )  # fmt: skip
     return root
 
 
@@ -143,12 +152,73 @@ def test_the_extended_twin_is_a_twin(found: Path, world: Path, dragged: list[Epi
     assert 0.0 < tips[0] < tips[1]  # 1.5 /s over 1/30 s: 2.5 % less of 33 mm
 
 
-def test_run_again_it_says_the_same_at_once(found: Path, world: Path) -> None:
+def test_run_again_it_says_the_same_at_once(found: Path, world: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The same job says nothing of what it replaces. What was said of a network goes: this twin has none."""
     before, pieces = read(found), (found / "journal.jsonl").read_text()
+    for name in ("guard.json", "guard.html"):
+        (found / name).write_text("of an earlier twin's network")
+    capsys.readouterr()
     assert diagnose(world / "suspect", world / "twin", found, "--reference", str(world / "reference")) == 0
     again = read(found)
     assert (found / "journal.jsonl").read_text() == pieces  # nothing was computed anew
+    assert not list(found.glob("guard.*")) and not list(found.glob("journal.old*"))
+    said = capsys.readouterr().err
+    assert "put aside" not in said and "replaced" not in said
     assert {k: v for k, v in again.items() if k != "seconds"} == {k: v for k, v in before.items() if k != "seconds"}
+
+
+def stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Diagnoses that are interrupted after their first piece."""
+
+    def first_piece(*_: object, journal: Journal, **__: object) -> None:
+        journal.once("base", lambda: 1)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pred_core.cli.diagnose_command.diagnose", first_piece)
+
+
+def test_another_job_in_the_folder_says_what_becomes_of_the_earlier_ones(
+    found: Path, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each interrupted run keeps its pieces under a number of its own; one line on stderr: where, why, what else."""
+    out, against = tmp_path / "out", ("--reference", str(world / "reference"))
+    shutil.copytree(found, out)
+    pieces = [(out / "journal.jsonl").read_text()]
+    stopped(monkeypatch)
+    other = matched()  # of another object altogether
+    other.save(tmp_path / "other")
+    jobs: list[tuple[Path, Path, tuple[str, ...], str]] = [
+        (world / "suspect", world / "twin", (*against, "--seed", "1"), "(seed 0, now 1)"),
+        (world / "suspect", world / "twin", (*against, "--level", "0.01"), "(level 0.05, now 0.01; seed 1, now 0)"),
+        (world / "suspect", world / "twin", (), "(with a reference, now without; level 0.01, now 0.05)"),
+        (world / "suspect", tmp_path / "other", (), "(another twin)"),
+        (world / "reference", tmp_path / "other", (), "(other bags in the data set)"),
+    ]
+    for number, (data, twin, flags, why) in enumerate(jobs, start=1):
+        capsys.readouterr()
+        assert diagnose(data, twin, out, *flags) == 130
+        (line,) = (t for t in capsys.readouterr().err.splitlines() if "put aside" in t)
+        assert why in line and str(out / f"journal.old{number}.jsonl") in line
+        assert "its diagnosis.json, report.html, twin will be replaced" in line.replace("next_motion.yaml, ", "")
+        assert [(out / f"journal.old{n + 1}.jsonl").read_text() for n in range(number)] == pieces
+        pieces.append((out / "journal.jsonl").read_text())
+        capsys.readouterr()
+        assert diagnose(data, twin, out, *flags) == 130  # the same job goes on
+        assert "put aside" not in capsys.readouterr().err and (out / "journal.jsonl").read_text() == pieces[-1]
+    assert read(out) == read(found)
+
+
+def test_an_answer_without_its_journal_is_told_of(
+    found: Path, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether it is of the same job cannot be known then: a damaged journal was deleted, say, as its error tells to."""
+    out = tmp_path / "out"
+    shutil.copytree(found, out)
+    (out / "journal.jsonl").unlink()
+    stopped(monkeypatch)
+    assert diagnose(world / "suspect", world / "twin", out) == 130
+    (line,) = (t for t in capsys.readouterr().err.splitlines() if "replaced" in t)
+    assert f"{out} holds diagnosis.json" in line and "without its journal.jsonl" in line
 
 
 def test_a_gripper_that_stands_still_tests_nothing(world: Path, tmp_path: Path) -> None:
@@ -264,7 +334,9 @@ def test_a_particle_that_is_never_measured(
     line = refusal(capsys, never, world / "twin", tmp_path / "out")
     assert f"{e.name}: particles of the twin are never measured" in line and "got id 5, 7;" in line
     assert "leave the episode out" in line and "rest_length" in line
-    against = ("--reference", str(never))
+    before = recorded(rope(), (), SPLITS, seed=100, frames=40)
+    before[2] = without(before[2], [5, 7], slice(None))
+    against = ("--reference", str(write(tmp_path / "never_before", before)))
     assert f"reference, {e.name}:" in refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", *against)
     once = write(tmp_path / "once", [*dragged[:2], without(e, [5], slice(1, None)), *dragged[3:]])
     line = refusal(capsys, once, world / "twin", tmp_path / "out")
@@ -274,15 +346,17 @@ def test_a_particle_that_is_never_measured(
 def test_a_reference_of_another_rate(
     world: Path, tmp_path: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    faster = []
-    for e in dragged:
+    def faster(e: Episode) -> Episode:
         stamps = e.stamps[0] + (e.stamps - e.stamps[0]) // 2
-        faster.append(dataclasses.replace(e, stamps=stamps, tracks=dataclasses.replace(e.tracks, stamp=stamps)))
-    against = ("--reference", str(write(tmp_path / "faster", faster, rate=60.0)))
+        return dataclasses.replace(e, stamps=stamps, tracks=dataclasses.replace(e.tracks, stamp=stamps))
+
+    before = recorded(rope(), (), SPLITS, seed=100, frames=40)
+    against = ("--reference", str(write(tmp_path / "before", [faster(e) for e in before], rate=60.0)))
     line = refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", *against)
     assert f"reference, {dragged[0].name}: the reference's frames" in line and "got 0.01666" in line
     assert "--reference recorded at the data set's rate" in line
-    line = refusal(capsys, tmp_path / "faster", world / "twin", tmp_path / "out", *against)
+    after = write(tmp_path / "after", [faster(e) for e in dragged], rate=60.0)
+    line = refusal(capsys, after, world / "twin", tmp_path / "out", *against)
     assert "Identify a twin at this rate" in line  # both come at it: it is the twin that differs
 
 
@@ -294,6 +368,104 @@ def test_a_damaged_journal(world: Path, found: Path, tmp_path: Path, capsys: pyt
     against = ("--reference", str(world / "reference"))
     line = refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", *against)
     assert "journal.jsonl: is damaged" in line and "Delete it" in line
+
+
+def tree(root: Path) -> dict[str, bytes]:
+    """Every file under a folder."""
+    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.parametrize("inside", ["twin", "deep/mine", "link"])
+def test_out_must_not_hold_the_questioned_twin(
+    inside: str, world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The answer's twin is written to OUT/twin: over the one that is questioned, also through a link."""
+    out = tmp_path / "out"
+    if inside == "link":
+        rope().save(tmp_path / "mine")
+        out.mkdir()
+        (out / "twin").symlink_to(tmp_path / "mine")
+        twin = tmp_path / "mine"
+    else:
+        twin = out / inside
+        rope().save(twin)
+    before = tree(tmp_path)
+    assert diagnose(world / "suspect", twin, out, "--reference", str(world / "reference")) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "--out holds the twin that is questioned" in line and f"--twin {twin}" in line
+    assert line.endswith("Give another --out.") and tree(tmp_path) == before
+
+
+def test_out_must_not_hold_a_twin_of_others(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One that `pred identify` wrote there, with nothing of a diagnosis beside it."""
+    rope().save(tmp_path / "twin")
+    before = tree(tmp_path)
+    assert diagnose(world / "suspect", world / "twin", tmp_path) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "a twin that no diagnosis wrote" in line and "move that twin away" in line and tree(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("which", "said"),
+    [("data", "of the data set"), ("reference", "of the reference"), ("twin", "of the twin"),
+     ("data/dataset.yaml", "of the data set")],
+)  # fmt: skip
+def test_out_must_not_be_an_input(
+    which: str, said: str, world: Path, tmp_path: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path / "data", dragged[:2])
+    shutil.copytree(world / "reference", tmp_path / "reference")
+    rope().save(tmp_path / "twin")
+    before = tree(tmp_path)
+    folder, _, file = which.partition("/")
+    data = tmp_path / "data" / file  # a data set may be given by its dataset.yaml
+    out = tmp_path / "data" / ".." / folder
+    assert diagnose(data, tmp_path / "twin", out, "--reference", str(tmp_path / "reference")) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert f"--out is the folder {said}" in line and line.endswith("Give another --out.") and tree(tmp_path) == before
+
+
+def test_a_data_set_where_the_answers_twin_goes(
+    tmp_path: Path, world: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path / "twin", dragged[:2])
+    before = tree(tmp_path)
+    assert diagnose(tmp_path / "twin", world / "twin", tmp_path) == 2
+    assert "would be written into the data set" in capsys.readouterr().err and tree(tmp_path) == before
+
+
+def test_a_reference_with_bags_of_the_data_set(
+    world: Path, tmp_path: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The data set itself shows no change; nor does one that holds some of its recordings, under whatever name."""
+    itself = ("--reference", str(world / "suspect"))
+    line = refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", *itself)
+    assert "got 6 of 6 bags in both: ep0.mcap, ep1.mcap, ep2.mcap, ep3.mcap, ep4.mcap and 1 more" in line
+    assert "Give another --reference, or leave it out" in line
+    old = recorded(rope(), (), SPLITS, seed=100, frames=40)
+    mixed = write(tmp_path / "mixed", [*old[:4], dataclasses.replace(old[4], name="again"), old[5]])
+    shutil.copy(world / "suspect" / "ep2.mcap", mixed / "again.mcap")
+    line = refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", "--reference", str(mixed))
+    assert "got 1 of 6 bags in both: ep2.mcap (there again.mcap);" in line
+
+
+def test_a_gravity_that_contradicts(
+    world: Path, tmp_path: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """1 % of 9.81 m/s^2 is allowed, as vectors: 9.80 or a tilt of half a degree pass, of a degree (0.17) do not."""
+    up, out = write(tmp_path / "up", dragged[:2], gravity=(0.0, 0.0, 9.81)), tmp_path / "out"
+    line = refusal(capsys, up, world / "twin", out)
+    assert f"[0, 0, 9.81] m/s^2 in dataset.yaml, [0, 0, -9.81] m/s^2 in {world / 'twin' / 'twin.yaml'}" in line
+    assert "Correct 'gravity' in dataset.yaml, or identify the twin on this data: pred identify" in line
+    line = refusal(capsys, world / "suspect", world / "twin", out, "--reference", str(up))
+    assert line.startswith(f"pred: reference {up}: its gravity contradicts the data set's") and "[0, 0, 9.81]" in line
+    line = refusal(capsys, up, world / "twin", out, "--reference", str(world / "reference"))
+    assert "the twin's" in line
+    line = refusal(capsys, write(tmp_path / "lean", dragged[:2], gravity=(0.1712, 0.0, -9.8085)), world / "twin", out)
+    assert "[0.1712, 0, -9.8085]" in line
+    rope().replace(scene=Scene(gravity=(0.08, 0.0, -9.80))).save(tmp_path / "twin")  # 0.081 apart
+    still = [dataclasses.replace(e, split="ood") for e in dragged[:2]]  # the next thing that is wrong is told
+    assert "'train'" in refusal(capsys, write(tmp_path / "near", still), tmp_path / "twin", out)
 
 
 # Another world of springs, in which the twin can be right -------------------------------------------------------------

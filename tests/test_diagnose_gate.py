@@ -117,7 +117,14 @@ def test_clocks_that_stumble_are_told() -> None:
     notes = measure([episodes[0], bad, episodes[2]], None, bare_twin()).notes
     assert any("uneven stamps" in n and "ep1" in n for n in notes)
     assert not any("clock" in n for n in measure(episodes, None, bare_twin()).notes)
-    assert any("exploratory" in n for n in notes)
+
+
+def test_few_episodes_widen_the_gates_own_intervals() -> None:
+    """That is all they say: whether the diagnosis is exploratory is decided on the train and test episodes."""
+    for count, said in ((3, "3 train episodes, fewer than the 10"), (1, "1 train episode, fewer than the 10")):
+        (note,) = (n for n in measure(moving_episodes(1, count=count), None, bare_twin()).notes if "fewer" in n)
+        assert "the gate's own intervals" in note and said in note and "exploratory" not in note
+    assert not any("fewer" in n for n in measure(moving_episodes(1, count=10), None, bare_twin()).notes)
 
 
 def test_nothing_to_judge() -> None:

@@ -36,8 +36,28 @@ def test_a_journal_belongs_to_its_data(tmp_path: Path) -> None:
     assert Journal(path, {"data": "a"}).once("x", lambda: [2.0]) == [1.0]
     other = Journal(path, {"data": "b"})
     assert other.once("x", lambda: [3.0]) == [3.0]
-    assert '"a"' in (tmp_path / "journal.old.jsonl").read_text()
+    assert '"a"' in (tmp_path / "journal.old1.jsonl").read_text()
     assert '"a"' not in path.read_text()
+
+
+def test_no_journal_that_was_put_aside_is_lost(tmp_path: Path) -> None:
+    """The next number that is free, and whoever asked is told where it went and what it was of."""
+    path, told = tmp_path / "journal.jsonl", []
+    (tmp_path / "journal.old2.jsonl").write_text("mine")
+    for name in "abc":
+        Journal(path, {"data": name}, lambda *where: told.append(where)).once("x", lambda: 1)
+    assert told == [(tmp_path / "journal.old1.jsonl", {"data": "a"}), (tmp_path / "journal.old3.jsonl", {"data": "b"})]
+    for aside, header in told:
+        assert json.loads(aside.read_text().splitlines()[0]) == {"header": header}
+    assert (tmp_path / "journal.old2.jsonl").read_text() == "mine"
+
+
+@pytest.mark.parametrize("line", ["a diary", "[1]", '{"header": 3}', "{}"])
+def test_a_file_that_is_no_journal_is_put_aside(tmp_path: Path, line: str) -> None:
+    path, told = tmp_path / "journal.jsonl", []
+    path.write_text(line + "\n")
+    Journal(path, {"data": "a"}, lambda *where: told.append(where)).once("x", lambda: 1)
+    assert told == [(tmp_path / "journal.old1.jsonl", None)] and told[0][0].read_text() == line + "\n"
 
 
 def test_nothing_is_written_before_a_piece_is_finished(tmp_path: Path) -> None:
@@ -48,7 +68,7 @@ def test_nothing_is_written_before_a_piece_is_finished(tmp_path: Path) -> None:
     Journal(path, {"data": "a"}).once("x", lambda: 1)
     before = path.read_text()
     Journal(path, {"data": "b"})
-    assert path.read_text() == before and not (tmp_path / "journal.old.jsonl").exists()
+    assert path.read_text() == before and not list(tmp_path.glob("journal.old*"))
 
 
 def test_a_line_that_was_cut_off_is_written_anew(tmp_path: Path) -> None:

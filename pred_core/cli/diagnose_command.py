@@ -8,6 +8,7 @@ import shlex
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from pred_core.bag.dataset import Dataset, load_dataset
 from pred_core.cli.checks import warn_of_another_object
@@ -15,8 +16,18 @@ from pred_core.cli.network_guard import question, question_or_say
 from pred_core.cli.settings import add_settings, given_settings, read_settings
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.fits import check_tracks
+from pred_core.diagnose.job import check_gravity, differences, job_of
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.motion_file import write_motion
+from pred_core.diagnose.out_folder import (
+    JOURNAL,
+    TWIN,
+    check_guard_out,
+    check_out,
+    remove_guard,
+    results_in,
+    said_of_earlier,
+)
 from pred_core.diagnose.report import write_report
 from pred_core.diagnose.report_network import read_network
 from pred_core.diagnose.result import Diagnosis
@@ -55,6 +66,8 @@ def run(args: argparse.Namespace) -> int:
     twin = Twin.load(args.twin)
     warn_of_another_object(twin, dataset, str(args.twin))
     if args.guard:
+        check_guard_out(args.out, dataset.root)
+        check_gravity(dataset, None, twin, args.twin)
         asked = _unseen(dataset)
         check_tracks(asked, (), twin)
         lines = question(twin, asked, args.out, args.dataset, args.twin)[1]
@@ -62,24 +75,26 @@ def run(args: argparse.Namespace) -> int:
         return 0
     network = None if args.network is None else read_network(args.network)
     reference = None if args.reference is None else load_dataset(args.reference)
-    journal = Journal(args.out / "journal.jsonl", _header(dataset, reference, twin, config))
     tell = _Progress(begin)
+    journal = _journal(args, dataset, reference, twin, config, tell)
     episodes = list(dataset.episodes())
     known = None if reference is None else list(reference.episodes())
     answer = diagnose(episodes, twin, known, config, tell, journal=journal, begin=begin)
     command = "pred " + shlex.join(_words(args))
     meta = dataclasses.replace(answer.twin.meta, created_by=command)
-    answer.twin.replace(meta=meta).save(args.out / "twin")
+    answer.twin.replace(meta=meta).save(args.out / TWIN)
     write_json(args.out / "diagnosis.json", {**answer.to_json(), "command": command})
     _write_next_motion(args.out / "next_motion.yaml", answer)
     guard = None
-    if twin.residual is not None:
+    if twin.residual is None:
+        remove_guard(args.out)
+    else:
         guard = question_or_say(twin, _unseen(dataset), args.out, args.dataset, args.twin, tell)
     write_report(args.out / "report.html", answer, episodes, known, command, network, guard)
     print(answer.sentence)
     for row in answer.ranking[:5]:
         print(f"  {row.probability:5.2f}  {row.id:24s} {row.rejected}")
-    print(f"{args.out / 'report.html'}  {args.out / 'diagnosis.json'}  {args.out / 'twin'}  ({answer.seconds:.0f} s)")
+    print(f"{args.out / 'report.html'}  {args.out / 'diagnosis.json'}  {args.out / TWIN}  ({answer.seconds:.0f} s)")
     return 0
 
 
@@ -116,13 +131,29 @@ def _write_next_motion(path: Path, answer: Diagnosis) -> None:
         print(f"to tell more, record: {answer.next_motion['name']} ({path})")
 
 
-def _header(dataset: Dataset, reference: Dataset | None, twin: Twin, config: DiagnoseConfig) -> dict[str, object]:
-    sets = [dataset] if reference is None else [dataset, reference]
-    hashes = [[s.sha256(e) for e in s.entries] for s in sets]
-    facts = [repr((s.entries, s.held, s.gravity, s.known, s.sigma)) for s in sets]
-    plain = dataclasses.replace(config, seconds=DiagnoseConfig().seconds)
-    asked = {"twin": twin.digest(), "levers": repr(twin.meta.levers), "config": repr(plain), "version": 3}
-    return {"data": hashes, "facts": facts, **asked}
+def _journal(
+    args: argparse.Namespace,
+    dataset: Dataset,
+    reference: Dataset | None,
+    twin: Twin,
+    config: DiagnoseConfig,
+    tell: _Progress,
+) -> Journal:
+    """The journal in the output folder, once the inputs fit together and the folder may be written to."""
+    data = {"the data set": dataset.root}
+    if reference is not None:
+        data["the reference"] = reference.root
+    check_out(args.out, args.twin, data)
+    check_gravity(dataset, reference, twin, args.twin)
+    job = job_of(dataset, reference, twin, config)
+
+    def put_aside(aside: Path, before: dict[str, Any] | None) -> None:
+        tell(said_of_earlier(args.out, aside, differences(before, job)))
+
+    journal = Journal(args.out / JOURNAL, job, put_aside)
+    if results_in(args.out) and not journal.found:
+        tell(said_of_earlier(args.out, None, ""))
+    return journal
 
 
 def _needed(args: argparse.Namespace) -> list[str]:

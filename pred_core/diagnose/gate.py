@@ -24,7 +24,7 @@ from pred_core.errors import DatasetError
 from pred_core.twin import Twin
 from pred_core.types import Array, Episode
 
-FEWEST = 10  # episodes for inference; fewer are exploratory
+FEWEST = 10  # train episodes that the gate's intervals are made for
 SMALLEST = 3e-4  # [m] at the object: less is not worth a name
 SMALLEST_SLIDE = 3e-3  # [m]
 OTHERS = 3  # tests besides the sensors': slide, table height, table tilt
@@ -51,7 +51,8 @@ def measure(
     sigma = noise_of(suspect)
     notes = list(clock_notes(suspect))
     if len(suspect) < FEWEST:
-        notes.append(f"{len(suspect)} episodes, fewer than {FEWEST}: exploratory")
+        count = "1 train episode" if len(suspect) == 1 else f"{len(suspect)} train episodes"
+        notes.append(f"the gate's own intervals are from {count}, fewer than the {FEWEST} they are made for")
     causes, change, slides = _sensor_causes(suspect, known, twin, sigma, notes)
     corrected = [change.correct(e) for e in suspect]
     causes += table_causes(corrected, known, twin.scene.ground, twin.body.radius, sigma, len(SENSOR_CAUSES) + OTHERS)
