@@ -123,6 +123,14 @@ def test_a_data_set_keeps_its_facts_and_what_was_finished(tmp_path: Path, capsys
     assert "other settings" in line and "particles 30" in line and "particles 31" in line
 
 
+def test_settings_for_another_kind_of_object_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    source = make_set(tmp_path / "pictures")
+    text = (source / FILE).read_text()
+    (source / FILE).write_text(text.replace("kind: line", "kind: sheet"))
+    assert track(source, tmp_path / "set") == 2
+    assert "its object is a sheet; got kind line" in capsys.readouterr().err
+
+
 def no_calibration(message: BagMessage) -> bool:
     return not message.topic.endswith(images.INFO)
 

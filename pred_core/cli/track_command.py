@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 from pred_core.bag.playlist import find_clips
 from pred_core.cli.convert_command import progress_line
 from pred_core.cli.settings import add_settings, parse_held, read_settings
+from pred_core.errors import ConfigError
 from pred_core.track.recorded import camera_names, track_dataset
 from pred_core.track.settings import TrackerSettings, read_settings_file
 
@@ -33,10 +35,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Track, write, and say how much was seen. Raises: PredError."""
     first = find_clips(args.source, points=False)[0]
-    values = {"cameras": " ".join(camera_names(first))}
+    values: dict[str, Any] = {"cameras": " ".join(camera_names(first))}
+    if first.kind:
+        values["kind"] = first.kind
     if args.settings is not None:
         values |= read_settings_file(args.settings)
     settings = read_settings(args, TrackerSettings, "pred track", values)
+    if first.kind and settings.kind != first.kind:
+        raise ConfigError(f"{args.source}: its object is a {first.kind}", got=f"kind {settings.kind}", allowed=first.kind)
     held = parse_held(args.held) if args.held is not None else None
     dataset, counts = track_dataset(args.source, settings, args.out, args.name, progress_line(), held)
     for count in counts:
