@@ -11,11 +11,13 @@ from report_cases import HOME, answer, drag, recorded, rope, with_errors
 
 from pred_core.calibration import Calibration
 from pred_core.diagnose.chosen import chosen_of
+from pred_core.diagnose.gate import GateCause
 from pred_core.diagnose.map import FEATURES, Replay, conditional, edges_of, from_above, grid_of, replay
 from pred_core.diagnose.next_motion import propose
 from pred_core.diagnose.pictures import whole_of
-from pred_core.diagnose.report import write_report
-from pred_core.diagnose.report_parts import budget_rows
+from pred_core.diagnose.report import with_clock, write_report
+from pred_core.diagnose.report_parts import budget_rows, span_of
+from pred_core.diagnose.result import Cause, Diagnosis
 from pred_core.effects import find_effect
 from pred_core.twin import Twin
 from pred_core.types import Episode
@@ -166,6 +168,69 @@ def test_a_change_of_structure_is_told_though_no_round_tried_it(
     write_report(tmp_path / "report.html", d, dragged, None, "pred diagnose")
     text = (tmp_path / "report.html").read_text("utf-8")
     assert "another structure of the model" in text and "it saves 60% of the loss" in text
+
+
+def written(d: Diagnosis, episodes: list[Episode], path: Path) -> str:
+    """The text of a report, as a reader sees it."""
+    write_report(path / "report.html", d, episodes, None, "pred diagnose")
+    return (path / "report.html").read_text("utf-8").replace("&#x27;", "'")
+
+
+def test_a_report_claims_no_more_than_was_done(twin: Twin, dragged: list[Episode], tmp_path: Path) -> None:
+    """The larger of two p values, since both causes must hold; no interval where only the search ended; what the gate
+    saw but left alone; three episodes, which are too few to draw from; what nobody tried; a network nobody measured.
+    """
+    d = answer(twin, dragged)
+    spans = {k: dataclasses.replace(v, low=0.0, high=50.0, interval=False) for k, v in d.causes[0].parameters.items()}
+    causes = (dataclasses.replace(d.causes[0], parameters=spans), Cause("wind", "wind", 0.7, {}, False, 0.3, 0.04))
+    table = GateCause("table_height", True, True, "they rest", "m", {"height": (0.01,)}, {}, 0.001, 0.01, 10.0)
+    delay = GateCause("delay", True, True, "12 episodes", "s", {"delay": (0.02,)}, {}, 0.001, 0.01, 5.0)
+    gate = dataclasses.replace(d.gate, causes=(table, delay))
+    text = written(dataclasses.replace(d, causes=causes, gate=gate), dragged, tmp_path)
+    assert "p 0.04 (the largest: all causes must hold)" in text and "p 0.001, " not in text
+    assert "<td>no interval</td>" in text and "0 to 50" not in text
+    assert "<td>another table height</td><td class=text>seen; left to the candidates above</td>" in text
+    assert "<td>a delay of the tracks</td><td>found</td>" in text
+    assert "(3 episodes: too narrow)</td>" in text and "mm (3 episodes: too narrow)." in text
+    assert "<td>learned by a network</td><td>not measured</td>" in text
+    assert "Told apart here: quadratic air drag" in text and "told apart here: quadratic air drag, wind" not in text
+    assert "family-wise over the finalists of a round, not over all that were screened" in text
+    assert "episodes it did not see" not in text
+
+
+def test_an_interval_over_few_episodes_says_so() -> None:
+    """Of five episodes the draws' spread is sqrt(4/5) of the standard error, and Student's t is 2.8 for 2.0."""
+    assert span_of(1.0, 2.0, 6) == "1.00 to 2.00"
+    assert span_of(1.0, 2.0, 5) == "1.00 to 2.00 (5 episodes: too narrow)"
+    assert span_of(1.5, 1.5, 1) == "no interval (1 episode)"
+
+
+def test_a_floor_above_what_is_left_is_not_drawn_as_the_floor(
+    twin: Twin, dragged: list[Episode], tmp_path: Path
+) -> None:
+    """The reference leaves 7.4 mm on its episodes, 5.0 mm are left here: these are no measured noise and chaos."""
+    d = answer(twin, dragged)
+    budget = {"named": {"drag_linear": 19.4}, "learned": 0.0, "unexplained": 0.0, "floor": 5.0}
+    for floor, name in ((7.4, "left, less than the reference leaves"), (5.0, "floor: noise, chaos, known misfit")):
+        errors = with_errors(d, (24.4,), (5.0,), floor)
+        rows = {n: mm for n, mm, _ in budget_rows(dataclasses.replace(d, errors=errors, budget=budget))}
+        assert rows[name] == 5.0
+    least = d.errors.extended.mean
+    errors = dataclasses.replace(d.errors, floor=least + 1.0)
+    budget = {**d.budget, "unexplained": 0.0, "floor": least}
+    text = written(dataclasses.replace(d, errors=errors, budget=budget), dragged, tmp_path)
+    assert f"The reference leaves {least + 1.0:.2f} mm on its own episodes, more than the {least:.2f} mm left" in text
+
+
+def test_time_in_the_recordings_is_shown_where_it_shows_something() -> None:
+    """Four episodes of ten frames: one after the other no time has the three that a mean needs; all at once, ten do."""
+    size, seen = np.ones((4, 10, 1)), np.ones((4, 10, 1), dtype=bool)
+    clock = np.broadcast_to(np.arange(10.0)[None, :, None], size.shape)
+    apart = clock + 100.0 * np.arange(4)[:, None, None]
+    for time, shown in ((clock, True), (apart, False)):
+        rows = dataclasses.replace(by_hand(size, clock, seen), features={"along": clock, "session": time})
+        (kept,) = with_clock([rows], 0)
+        assert set(kept.features) == ({"along", "session"} if shown else {"along"})
 
 
 @pytest.mark.parametrize("outcome", ["none", "named", "group", "unknown"])

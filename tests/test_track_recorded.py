@@ -127,7 +127,7 @@ def test_settings_for_another_kind_of_object_are_refused(tmp_path: Path, capsys:
     source = make_set(tmp_path / "pictures")
     text = (source / FILE).read_text()
     (source / FILE).write_text(text.replace("kind: line", "kind: sheet"))
-    assert track(source, tmp_path / "set") == 2
+    assert track(source, tmp_path / "set", "--kind", "line") == 2
     assert "its object is a sheet; got kind line" in capsys.readouterr().err
 
 

@@ -42,7 +42,8 @@ def run(args: argparse.Namespace) -> int:
         values |= read_settings_file(args.settings)
     settings = read_settings(args, TrackerSettings, "pred track", values)
     if first.kind and settings.kind != first.kind:
-        raise ConfigError(f"{args.source}: its object is a {first.kind}", got=f"kind {settings.kind}", allowed=first.kind)
+        what = f"{args.source}: its object is a {first.kind}"
+        raise ConfigError(what, got=f"kind {settings.kind}", allowed=first.kind)
     held = parse_held(args.held) if args.held is not None else None
     dataset, counts = track_dataset(args.source, settings, args.out, args.name, progress_line(), held)
     for count in counts:

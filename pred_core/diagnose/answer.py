@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pred_core.calibration import Calibration
 from pred_core.config import to_mapping
 from pred_core.diagnose.causes import causes_of, evidence_of
 from pred_core.diagnose.errors import EpisodeErrors, episode_errors, gain_of
@@ -20,10 +21,11 @@ from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.ranking import ranking
 from pred_core.diagnose.result import Cause, Diagnosis, Errors
 from pred_core.diagnose.roll import Roller
-from pred_core.diagnose.said import not_identifiable, sentence
+from pred_core.diagnose.said import not_identifiable, sentence, unproven, without_interval
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
+CHEAP = 2.0  # [s] that replaying the given twin may take, for what refining changed
 PARTLY = 0.3  # share of the excess from which a cause is the answer although something is left
 
 
@@ -44,10 +46,15 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
     """The whole answer; replays whole held-out episodes."""
     config = study.bench.config
     ranked = ranking(study.gate, progress)
-    causes = causes_of(study.gate, progress, {r.id: r.probability for r in ranked})
     split = "test" if any(e.split == "test" for e in study.corrected) else "train"
     tell(f"errors on the {split} episodes")
+    started = time.monotonic()
     errors = _errors(study, progress, split)
+    refining = refining_of(study, errors, (time.monotonic() - started) / 2.0)
+    budget = _budget(study, progress, errors)
+    causes = causes_of(
+        study.gate, progress, {r.id: r.probability for r in ranked}, closed_by_gate(study.gate, budget["named"], errors)
+    )
     ood = _errors(study, progress, "ood") if any(e.split == "ood" for e in study.corrected) else None
     outcome = _outcome(causes, progress)
     result = Diagnosis(
@@ -57,12 +64,12 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         ranking=tuple(ranked),
         errors=errors,
         errors_ood=ood,
-        budget=_budget(study, progress, errors),
+        budget=budget,
         not_identifiable=tuple(not_identifiable(progress, study.corrected)),
         not_testable=_not_testable(study.gate, progress),
         next_motion=None,
         exploratory=exploratory(study.bench),
-        notes=_notes(study, progress, errors, ood),
+        notes=_notes(study, progress, causes, errors, ood, refining),
         gate=study.gate,
         rounds=tuple(progress.rounds),
         base_twin=study.bench.twin,
@@ -81,7 +88,7 @@ def _outcome(causes: Sequence[Cause], progress: Progress) -> str:
     physics = [c for c in causes if not c.measured]
     cold = progress.bench.reference is None  # nobody knows there how much there is to explain
     least = progress.bench.config.enough if cold else PARTLY
-    if progress.unknown and max((c.closed for c in physics), default=0.0) < least:
+    if progress.unknown and max((c.closed or 0.0 for c in physics), default=0.0) < least:
         return "unknown"
     if not causes:
         return "none"
@@ -145,6 +152,27 @@ def _budget(study: Study, progress: Progress, errors: Errors) -> dict[str, Any]:
     return {"named": named, "learned": 0.0, "unexplained": errors.extended.mean - floor, "floor": floor}
 
 
+def closed_by_gate(gate: GateResult, named: Mapping[str, float], errors: Errors) -> dict[str, float | None]:
+    """Sensor cause -> share, 0 to 1, of the excess error that its correction took away; None: there is no excess."""
+    excess = errors.base.mean - (errors.floor or 0.0)
+    return {
+        c.id: min(max(named[c.id] / excess, 0.0), 1.0) if excess > 0.0 else None
+        for c in gate.accepted
+        if c.id in gate.sensor_ids
+    }
+
+
+def refining_of(study: Study, errors: Errors, took: float) -> str:
+    """What the base is, and by how much it differs from the given twin. `took` [s] of replaying the episodes once."""
+    source = "the train episodes" if study.bench.reference is None else "the reference"
+    text = f"base: your twin refined on {source}, not as it was given"
+    if took > CHEAP:
+        return text
+    given = study.given.replace(calibration=Calibration(), residual=None)
+    before = episode_errors(given, _before(study, errors.split), study.session).mean
+    return f"{text}: on the {errors.split} episodes {before:.1f} mm as given, {errors.base.mean:.1f} mm refined"
+
+
 def _not_testable(gate: GateResult, progress: Progress) -> Mapping[str, str]:
     rows = {c.id: c.why for c in gate.causes if not c.testable}
     for judged, _, why in (row for r in progress.rounds for row in r.judged):
@@ -153,10 +181,17 @@ def _not_testable(gate: GateResult, progress: Progress) -> Mapping[str, str]:
     return rows
 
 
-def _notes(study: Study, progress: Progress, errors: Errors, ood: Errors | None) -> tuple[str, ...]:
-    rows = [*study.gate.notes, *progress.notes]
-    if why := one_recording(study.bench):
-        rows.append(why)
+def _notes(
+    study: Study, progress: Progress, causes: Sequence[Cause], errors: Errors, ood: Errors | None, refining: str
+) -> tuple[str, ...]:
+    rows = [
+        *study.gate.notes,
+        *progress.notes,
+        refining,
+        unproven(causes, errors, study.bench.config.window),
+        one_recording(study.bench),
+        without_interval(causes),
+    ]
     for e in (errors, ood):
         for title, side in () if e is None else (("base", e.base), ("extended", e.extended)):
             if side.diverged:
@@ -167,4 +202,4 @@ def _notes(study: Study, progress: Progress, errors: Errors, ood: Errors | None)
         rows.append(f"left out to measure what they are worth: {', '.join(study.bench.config.left_out)}")
     if study.given.residual is not None:
         rows.append("the twin's network was left out: the base is its simulation alone")
-    return tuple(rows)
+    return tuple(row for row in rows if row)

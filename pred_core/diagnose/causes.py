@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from pred_core.diagnose.gate import GateCause, GateResult
+from pred_core.diagnose.naming import one_recording
 from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.result import Cause, Value
 from pred_core.diagnose.structure import FAMILY, ID
@@ -13,15 +14,20 @@ from pred_core.effects import LIBRARY, find_effect
 from pred_core.twin import Extension
 
 
-def causes_of(gate: GateResult, progress: Progress, probability: Mapping[str, float]) -> tuple[Cause, ...]:
-    """Sensor causes first, then physics in the order it was named."""
+def causes_of(
+    gate: GateResult, progress: Progress, probability: Mapping[str, float], closed: Mapping[str, float | None]
+) -> tuple[Cause, ...]:
+    """Sensor causes first, then physics in the order it was named. `closed`: share of the excess error that correcting
+    each sensor cause took away."""
     rows = [
-        Cause(c.id, family_of(c.id), probability[c.id], _gate_values(c), True, 1.0, c.p_adjusted, c.confused_with)
+        Cause(c.id, family_of(c.id), probability[c.id], _gate_values(c), True, closed[c.id], c.p_adjusted,
+              c.confused_with)
         for c in gate.accepted
         if c.id in gate.sensor_ids
-    ]
+    ]  # fmt: skip
+    single = bool(one_recording(progress.bench))
     for n in progress.named:
-        rows += _named(n, probability)
+        rows += _named(n, probability, single)
     names = {c.id for c in rows}
     return tuple(dataclasses.replace(c, group=tuple(g for g in c.group if g not in names)) for c in rows)
 
@@ -33,12 +39,13 @@ def family_of(id: str) -> str:
     return LIBRARY[id].family if id in LIBRARY else "camera"
 
 
-def _named(n: Named, probability: Mapping[str, float]) -> list[Cause]:
+def _named(n: Named, probability: Mapping[str, float], single: bool) -> list[Cause]:
+    """One cause, or two; `single`: all train episodes are of one recording, which tells of no scatter."""
     j = n.judged
     sure = probability[j.trial.id]
     if j.trial.ids == (ID,):
         knob = j.trial.space.knobs[0]
-        value = Value(j.values[knob.name], knob.unit, *j.intervals[knob.name])
+        value = Value(j.values[knob.name], knob.unit, *j.intervals[knob.name], interval=not single)
         return [Cause(ID, FAMILY, sure, {knob.name: value}, False, n.closed, n.p_adjusted)]
     rows = []
     for id in j.trial.ids:
@@ -52,8 +59,9 @@ def _named(n: Named, probability: Mapping[str, float]) -> list[Cause]:
             size = next(q.size for q in effect.parameters if q.name == plain)
             low, high = j.intervals[knob.name]
             values[name if size > 1 else plain] = Value(
-                j.values[knob.name], knob.unit, low, high, j.at_bound[knob.name]
-            )
+                j.values[knob.name], knob.unit, low, high, j.at_bound[knob.name],
+                interval=not single and (low, high) != (knob.low, knob.high),
+            )  # fmt: skip
         rows.append(Cause(id, effect.family, sure, values, False, n.closed, n.p_adjusted, n.group))
     return rows
 
@@ -64,7 +72,8 @@ def _gate_values(cause: GateCause) -> dict[str, Value]:
         spans: Sequence[tuple[float, float]] = cause.interval.get(name, ())
         for k, value in enumerate(values):
             low, high = spans[k] if k < len(spans) else (value, value)
-            rows[name if len(values) == 1 else f"{name}[{k}]"] = Value(value, cause.unit, low, high)
+            key = name if len(values) == 1 else f"{name}[{k}]"
+            rows[key] = Value(value, cause.unit, low, high, interval=k < len(spans))
     return rows
 
 

@@ -31,9 +31,11 @@ class Judged:
     values: dict[str, float]  # knob -> fitted value, on all train episodes
     null: dict[str, float]  # knob -> value without the change: off, or what the reference says
     intervals: dict[str, tuple[float, float]]  # 90 %, by leaving out recordings
-    gain: Array  # (E,) loss saved on each episode by parameters that did not see it
+    # Parameters for an episode whose recording is fitted are one step from the joint fit, taken without that recording
+    # (`fit.without_groups`); for any other they are the joint fit's.
+    gain: Array  # (E,) loss saved on each episode
     acts: NDArray[np.bool_]  # (E,) it moves the episode at all
-    extended: Array  # (E,) loss with it, parameters that did not see the episode
+    extended: Array  # (E,) loss with it
     z: Array  # coordinates of `values`
 
     @property
@@ -91,9 +93,12 @@ def family_wise(judged: Sequence[Judged], seed: int, groups: NDArray[np.int64] |
     every flip: so gains that lie in few episodes (a patch) are not held against what even ones could reach.
 
     `groups` (E,): recordings, whose episodes are flipped together; from fewer than FEWEST_GROUPS, which tell too
-    little apart, episodes are flipped one by one. No parameter was fitted on the recording that it is judged on, so
-    gains of episodes of one recording are hardly alike where nothing is hidden: on 41 controls the intraclass
+    little apart, episodes are flipped one by one. Parameters for a recording come from a step that leaves it out of
+    the joint fit, and gains of its episodes are hardly alike where nothing is hidden: on 41 controls the intraclass
     correlation is -0.03 (median -0.08, 156 fits).
+
+    "These candidates" are a round's finalists, chosen among all by a screening on the train episodes, which p leaves
+    out; how often something is named where nothing is hidden is measured on controls (`benchmarks/hidden_effects.py`).
     """
     gains = np.stack([j.gain for j in judged])
     generator = np.random.default_rng(seed)

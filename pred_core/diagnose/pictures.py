@@ -49,7 +49,7 @@ def evidence(seen: Round, words: dict[str, str], named: Judged | None, seed: int
     axes.set_ylim(-0.6, len(judged) - 0.4)
     every = 100.0 * np.concatenate([j.gain for j in judged]) / excess
     axes.set_xlim(max(float(every.min()) - 5.0, -150.0), min(float(every.max()) + 5.0, 400.0))
-    tidy(axes, f"saved on episodes it was not fitted on [% of {of}]", "")
+    tidy(axes, f"saved on the episodes it is judged on [% of {of}]", "")
     axes.grid(False, axis="y")
     axes.tick_params(axis="y", colors=INK)
     return figure

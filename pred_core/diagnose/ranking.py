@@ -25,7 +25,8 @@ def explains(closed: float) -> float:
 
 
 def nothing(p: float) -> float:
-    """Probability that nothing is there, from the least family-wise p of a round in which nothing was named.
+    """Probability that nothing is there, from the least family-wise p of a round in which nothing was named, or from
+    that of a cause which the gate found.
 
     Even odds before; p is uniform where nothing is there, and distributed as p^a where something is (Beta(a, 1);
     Sellke, Bayarri and Berger, The American Statistician 55, 2001), a from how often effects are found.
@@ -49,7 +50,7 @@ def ranking(gate: GateResult, progress: Progress) -> list[Ranked]:
     """
     floor = progress.bench.reference is not None
     before = [
-        Ranked(c.id, "", 1.0 - 0.5 * min(1.0, c.p_adjusted), 0.0, c.p_adjusted, "")
+        Ranked(c.id, "", 1.0 - nothing(c.p_adjusted), 0.0, c.p_adjusted, "")
         for c in gate.accepted
         if c.id in gate.sensor_ids
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,13 +13,14 @@ from pred_core.diagnose import pictures, pictures_map, pictures_motion
 from pred_core.diagnose import report_parts as parts
 from pred_core.diagnose.errors import predicted
 from pred_core.diagnose.guard import Guard
-from pred_core.diagnose.map import WINDOW, Replay, replay
+from pred_core.diagnose.map import WINDOW, Replay, conditional, edges_of, replay
 from pred_core.diagnose.report_network import Network, add_network
 from pred_core.diagnose.result import Diagnosis
 from pred_core.evaluate.style import INK
 from pred_core.report import Page, Track, animation
 from pred_core.types import Array, Episode
 
+FEWEST_BINS = 3  # with a mean, of the time in the recordings
 MOVED = 1e-3  # [m] by which a calibration must move the tracks to be drawn beside them
 
 
@@ -77,7 +79,7 @@ def _given(d: Diagnosis) -> Calibration:
 
 def _map(page: Page, d: Diagnosis, episodes: Sequence[Episode], reference: Sequence[Episode] | None) -> None:
     page.heading("Where and when the error sits")
-    rows = replays(d, episodes, reference)
+    rows = with_clock(replays(d, episodes, reference), d.seed)
     also = " Reference: the base on the reference's episodes." if rows[-1].name == "reference" else ""
     page.figure(
         pictures_map.curves(rows, d.seed),
@@ -94,6 +96,18 @@ def _map(page: Page, d: Diagnosis, episodes: Sequence[Episode], reference: Seque
             pictures_map.direction(rows, d.base_twin.body.arc),
             "Which way it pulls along the object: mean of measured minus predicted, in world axes.",
         )
+
+
+def with_clock(rows: list[Replay], seed: int) -> list[Replay]:
+    """Without the time in the recordings, where that leaves too few points to show how the error goes with it."""
+    if "session" not in rows[0].features:
+        return rows
+    curve = conditional(rows[0], "session", edges_of(rows[0], "session"), np.random.default_rng(seed))
+    if np.isfinite(curve.mean).sum() >= FEWEST_BINS:
+        return rows
+    return [
+        dataclasses.replace(r, features={k: v for k, v in r.features.items() if k != "session"}) for r in rows
+    ]
 
 
 def _overlay(page: Page, d: Diagnosis, episodes: Sequence[Episode]) -> None:

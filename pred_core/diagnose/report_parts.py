@@ -13,12 +13,12 @@ from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.gate_result import GateCause
 from pred_core.diagnose.progress import Round
 from pred_core.diagnose.result import Diagnosis, Errors
-from pred_core.diagnose.said import NAMES
-from pred_core.effects import LIBRARY
+from pred_core.diagnose.said import NAMES, confusions
 from pred_core.evaluate.bootstrap import bootstrap_interval
 from pred_core.report import Page, number
 
 MOST_PARAMETERS = 6  # of a cause in the summary; a profile has many
+FEWEST = 6  # episodes; drawing fewer gives intervals that are clearly too narrow: by sqrt(1 - 1/n), and no Student's t
 
 
 def words(id: str) -> str:
@@ -35,7 +35,7 @@ def summary(page: Page, d: Diagnosis) -> None:
             kind = "sensor" if c.measured else "physics"
             first = (words(c.id), f"{c.probability:.2f}", kind) if n == 0 else ("", "", "")
             unit = "" if v.unit == "1" else f" {v.unit}"
-            span = f"{number(v.low)} to {number(v.high)}"
+            span = f"{number(v.low)} to {number(v.high)}" if v.interval else "no interval"
             rows.append((*first, name, f"{number(v.value)}{unit}{edge}", span))
         more = len(c.parameters) - MOST_PARAMETERS
         if more > 0:
@@ -46,18 +46,41 @@ def summary(page: Page, d: Diagnosis) -> None:
         ("episodes", "base [mm]", "extended [mm]", "reference [mm]", "gain [mm]", "95 % interval", "improved"),
         [_error_row(e) for e in (d.errors, d.errors_ood) if e is not None],
     )
-    p = min((c.p_adjusted for c in d.causes), default=None)
     note = "Whole episodes, open loop; mean distance of free particles. Intervals draw episodes."
-    page.text(note if p is None else f"{note} p {p:.2g}, adjusted for the number of candidates.", note=True)
+    page.text(f"{note}{_significance(d)}", note=True)
     for line in d.notes:
         page.text(line, note=True)
+
+
+def _significance(d: Diagnosis) -> str:
+    """The p value of all that was named, and what it is adjusted for."""
+    if not d.causes:
+        return ""
+    last = max(d.causes, key=lambda c: c.p_adjusted)
+    over = ""
+    if last.measured:
+        over = ", adjusted for all causes that were measured without the simulation"
+    elif last.id in d.judged_ids:
+        rows = [(j, q) for seen in d.rounds for j, q, why in seen.judged if not why and last.id in j.trial.ids]
+        pair = any(len(j.trial.ids) > 1 and q == last.p_adjusted for j, q in rows)
+        over = f", adjusted for the {'pairs' if pair else 'finalists'} of its round"
+    several = " (the largest: all causes must hold)" if len(d.causes) > 1 else ""
+    return f" p {d.p_adjusted:.2g}{over}{several}."
+
+
+def span_of(low: float, high: float, episodes: int) -> str:
+    """An interval from drawing episodes, and what to think of it."""
+    if episodes < 2:
+        return "no interval (1 episode)"
+    narrow = f" ({episodes} episodes: too narrow)" if episodes < FEWEST else ""
+    return f"{low:.2f} to {high:.2f}{narrow}"
 
 
 def _error_row(e: Errors) -> tuple[str, ...]:
     g = e.gain
     return (
         e.split, f"{e.base.mean:.2f}", f"{e.extended.mean:.2f}", "–" if e.floor is None else f"{e.floor:.2f}",
-        f"{g.mean:.2f}", f"{g.low:.2f} to {g.high:.2f}", f"{g.improved} of {g.episodes}",
+        f"{g.mean:.2f}", span_of(g.low, g.high, g.episodes), f"{g.improved} of {g.episodes}",
     )  # fmt: skip
 
 
@@ -65,16 +88,19 @@ def add_evidence(page: Page, d: Diagnosis) -> None:
     """Every candidate with what it saves and why it is not named, round by round."""
     page.heading("Evidence: what explains it, and what does not")
     page.text(
-        "A candidate is fitted on the train episodes and judged on episodes it did not see. 100 % is the mean excess "
-        "of the base over what the reference leaves (without a reference: over nothing). Dots are episodes, bars 95 %.",
+        "All candidates are screened on the train episodes; those that lead, the finalists, are fitted on all of these "
+        "jointly and judged on every episode: by the joint fit where its recording was not fitted, else by parameters "
+        "that a step from the joint fit gives without that recording (if there is another). p is family-wise over the "
+        "finalists of a round, not over all that were screened. 100 % is the mean excess of the base over what the "
+        "reference leaves (without a reference: over nothing). Dots are episodes, bars 95 %.",
         note=True,
     )
-    tried = {i for seen in d.rounds for j, _, _ in seen.judged for i in j.trial.ids}
+    tried = d.judged_ids
     for c in d.causes:
         if c.measured:
             page.text(f"{words(c.id)}: measured without the simulation, see below; corrected before anything is tried.")
         elif c.id not in tried:
-            share = f"it saves {c.closed:.0%} of the loss of the base (p {c.p_adjusted:.2g})"
+            share = f"it saves {c.closed or 0.0:.0%} of the loss of the base (p {c.p_adjusted:.2g})"
             page.text(f"{words(c.id)}: another structure of the model, asked before the candidates; {share}.")
     if not d.rounds:
         page.text("No candidate was tried.")
@@ -147,11 +173,17 @@ def budget_rows(d: Diagnosis) -> list[tuple[str, float, str]]:
         rows.append((words(id), float(mm), pictures.NAMED[n % len(pictures.NAMED)]))
     rows.append(("learned by a network", float(d.budget["learned"]), pictures.LEARNED))
     rows.append(("unexplained", float(d.budget["unexplained"]), pictures.UNEXPLAINED))
-    rows.append(("floor: noise, chaos, known misfit", float(d.budget["floor"]), pictures.FLOOR))
+    floor = "left, less than the reference leaves" if _under_floor(d) else "floor: noise, chaos, known misfit"
+    rows.append((floor, float(d.budget["floor"]), pictures.FLOOR))
     rest = d.errors.base.mean - sum(v for _, v, _ in rows)
     if abs(rest) > 1e-6 * max(d.errors.base.mean, 1.0):
         rows.append(("base refitted", rest, pictures.OTHER))
     return rows
+
+
+def _under_floor(d: Diagnosis) -> bool:
+    """Less is left than the reference leaves on its own episodes."""
+    return d.errors.floor is not None and d.errors.floor > d.errors.extended.mean
 
 
 def add_budget(page: Page, d: Diagnosis) -> None:
@@ -161,9 +193,18 @@ def add_budget(page: Page, d: Diagnosis) -> None:
     what = f"Where the {total:.1f} mm of the base come from ({d.errors.split} episodes)."
     page.figure(pictures.budget_bar(rows), what)
     table = [(name, f"{mm:.2f}", f"{100 * mm / total:.0f} %" if total > 0 else "–") for name, mm, _ in rows if mm]
+    if not d.budget["learned"]:
+        table.append(("learned by a network", "not measured", "–"))
     table.append(("sum = base", f"{sum(v for _, v, _ in rows):.2f}", "100 %"))
     page.table(("part", "mm", "share"), table, [*[""] * (len(table) - 1), "strong"])
     page.text(_bands(d), note=True)
+    if _under_floor(d):
+        page.text(
+            f"The reference leaves {d.errors.floor:.2f} mm on its own episodes, more than the "
+            f"{d.errors.extended.mean:.2f} mm left here: how much of these noise, chaos and known misfit make is not "
+            "known, and nothing counts as unexplained.",
+            note=True,
+        )
     if d.errors.floor is None:
         page.text("Without a reference there is no floor: noise and chaos are part of what is unexplained.", note=True)
 
@@ -176,7 +217,9 @@ def _bands(d: Diagnosis) -> str:
             return "One episode: no interval."
         spans.append(bootstrap_interval(values, np.random.default_rng(d.seed)))
     (a, b), (c, e) = spans
-    return f"95 % over episodes: taken away {a:.2f} to {b:.2f} mm, left {c:.2f} to {e:.2f} mm."
+    count = len(d.errors.base.values)
+    narrow = f" ({count} episodes: too narrow)" if count < FEWEST else ""
+    return f"95 % over episodes: taken away {a:.2f} to {b:.2f} mm, left {c:.2f} to {e:.2f} mm{narrow}."
 
 
 def add_gate(page: Page, d: Diagnosis) -> None:
@@ -187,12 +230,14 @@ def add_gate(page: Page, d: Diagnosis) -> None:
               "90 %; p is adjusted for all causes tested.", note=True)  # fmt: skip
     rows, marks = [], []
     for c in d.gate.causes:
-        verdict = "found" if c.accepted else "not found" if c.testable else "not testable"
+        corrected = c.accepted and c.id in d.gate.sensor_ids
+        seen = "found" if corrected else "seen; left to the candidates above"
+        verdict = seen if c.accepted else "not found" if c.testable else "not testable"
         p = f"{c.p_adjusted:.2g}" if c.testable else "–"
         effect = f"{c.effect_mm:.2f}" if c.parameters else "–"
         near = f"; as well: {', '.join(map(words, c.confused_with))}" if c.confused_with else ""
         rows.append((words(c.id), verdict, _measured(c), p, effect, c.why + near))
-        marks.append("strong" if c.accepted else "" if c.testable else "warn")
+        marks.append("strong" if corrected else "" if c.testable else "warn")
     page.table(("cause", "verdict", "estimate", "p adjusted", "at the object [mm]", "rests on"), rows, marks)
 
 
@@ -224,9 +269,9 @@ def add_open_questions(page: Page, d: Diagnosis) -> None:
         if c.group:
             page.text(f"These data do not tell {words(c.id)} from {', '.join(map(words, c.group))}.")
         elif not c.measured:
-            usual = [words(i) for i in LIBRARY[c.id].confounded_with] if c.id in LIBRARY else []
-            if usual:
-                page.text(f"Often confused with {words(c.id)}, and told apart here: {', '.join(usual)}.", note=True)
+            rows = [f"{how}: {', '.join(map(words, ids))}" for how, ids in confusions(d, c).items() if ids]
+            if rows:
+                page.text(f"Often confused with {words(c.id)}. {'; '.join(rows)}.", note=True)
     page.table(("no data of this kind tells",), [(line,) for line in d.not_identifiable])
     if d.not_testable:
         page.table(("not testable with these motions", "why"), [(words(k), v) for k, v in d.not_testable.items()])

@@ -23,6 +23,7 @@ class Value:
     low: float  # 90 % interval
     high: float
     at_bound: bool = False
+    interval: bool = True  # False: low and high are only the bounds of the search, nothing measured
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,9 @@ class Cause:
     probability: float
     parameters: Mapping[str, Value]
     measured: bool = False  # found by the model-free gate, corrected where data enter
-    closed: float = 0.0  # share of the excess error of its round that it closes
+    # Share of the excess that it closes: of its round's loss, or, corrected where data enter, of the error of whole
+    # held-out episodes; None: there is no excess to take a share of.
+    closed: float | None = 0.0
     p_adjusted: float = 1.0
     group: tuple[str, ...] = ()  # these data do not tell it apart from
 
@@ -46,7 +49,7 @@ class Ranked:
     id: str
     family: str
     probability: float
-    gain: float  # share of the excess loss it saves on held-out episodes
+    gain: float  # share of the excess loss it saves on the episodes it is judged on; 0 of what the gate measured
     p_adjusted: float
     rejected: str  # why it is not named; "" = it is
     values: Mapping[str, float] = field(default_factory=dict)
@@ -89,6 +92,16 @@ class Diagnosis:
     explained: float | None = None  # share of the motion in windows of held-out episodes; None: it hardly moves
     settings: Mapping[str, Any] = field(default_factory=dict)  # of the run
 
+    @property
+    def p_adjusted(self) -> float:
+        """The largest of the causes': all must hold. 1 where nothing was named."""
+        return max((c.p_adjusted for c in self.causes), default=1.0)
+
+    @property
+    def judged_ids(self) -> set[str]:
+        """Candidates that were fitted to the end, in any round, alone or with another."""
+        return {i for seen in self.rounds for j, _, _ in seen.judged for i in j.trial.ids}
+
     def to_json(self) -> dict[str, Any]:
         """`diagnosis.json` (DESIGN.md, and beside it what the report shows)."""
         e = self.errors
@@ -110,7 +123,7 @@ class Diagnosis:
             "gain": {
                 "mean_mm": e.gain.mean, "low_mm": e.gain.low, "high_mm": e.gain.high,
                 "episodes_improved": f"{e.gain.improved}/{e.gain.episodes}",
-                "p_adjusted": max((c.p_adjusted for c in self.causes), default=1.0),
+                "p_adjusted": self.p_adjusted,
             },
             "budget": dict(self.budget),
             "not_identifiable": list(self.not_identifiable),

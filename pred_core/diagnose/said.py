@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pred_core.diagnose.skill import POOR
+from pred_core.effects import LIBRARY
 from pred_core.types import Episode
 
 if TYPE_CHECKING:
     from pred_core.diagnose.progress import Progress
-    from pred_core.diagnose.result import Cause, Diagnosis
+    from pred_core.diagnose.result import Cause, Diagnosis, Errors
 
 NAMES = {
     "bending_by_angle": "resistance to bending by angle, instead of springs that skip particles",
@@ -48,7 +49,7 @@ def called(cause: Cause) -> str:
     unit = "" if values[0].unit == "1" else f" {values[0].unit}"
     if len(values) == 1:
         v = values[0]
-        return f"{words}: {v.value:.3g}{unit} [{v.low:.3g}, {v.high:.3g}]"
+        return f"{words}: {v.value:.3g}{unit} {f'[{v.low:.3g}, {v.high:.3g}]' if v.interval else '(no interval)'}"
     if len(values) > 3:  # a profile
         return words
     return f"{words}: ({', '.join(f'{v.value:.3g}' for v in values)}){unit}"
@@ -58,10 +59,10 @@ def sentence(d: Diagnosis) -> str:
     """The sentence a report opens with."""
     e = d.errors
     held = "held-out error" if e.split == "test" else "error on the episodes it was fitted to"
-    numbers = (
-        f"the {held} falls from {e.base.mean:.1f} to {e.extended.mean:.1f} mm, "
-        f"{e.gain.improved} of {e.gain.episodes} episodes"
-    )
+    count = f"{e.gain.improved} of {e.gain.episodes} episodes"
+    numbers = f"the {held} {trend(e)}, {count if falls(e) else f'lower in {count}'}"
+    if not d.causes:  # nothing was added that could change it
+        numbers = f"the {held} is {e.base.mean:.1f} mm"
     label = "Exploratory, too few episodes or recordings for a firm answer: " if d.exploratory else ""
     if d.outcome == "none":
         return f"{label}Nothing is found that your simulation lacks: its {held} is {e.base.mean:.1f} mm."
@@ -79,11 +80,66 @@ def sentence(d: Diagnosis) -> str:
     return f"{label}Your simulation lacks {what}{unsure}; with it {numbers}.{more}"
 
 
+def falls(e: Errors) -> bool:
+    """Whether the error gets smaller, in the one digit that is shown."""
+    return e.extended.mean < e.base.mean and f"{e.extended.mean:.1f}" != f"{e.base.mean:.1f}"
+
+
+def trend(e: Errors) -> str:
+    """What the error does from base to extended: "falls from 24.4 to 5.0 mm", "rises from ..", "stays at .."."""
+    before, after = f"{e.base.mean:.1f}", f"{e.extended.mean:.1f}"
+    if before == after:
+        return f"stays at {before} mm"
+    return f"{'falls' if falls(e) else 'rises'} from {before} to {after} mm"
+
+
+def unproven(causes: Sequence[Cause], e: Errors, window: float) -> str:
+    """That whole episodes do not bear out what was named on windows of `window` [s]; "" where they do."""
+    if not causes or falls(e):
+        return ""
+    measured = all(c.measured for c in causes)
+    how = "measured without the simulation" if measured else f"judged on windows of {window:g} s"
+    held = "whole held-out episodes" if e.split == "test" else "the whole episodes it was fitted to"
+    return (
+        f"what was found was {how}; on {held} the error did not fall ({e.base.mean:.1f} to {e.extended.mean:.1f} mm): "
+        f"the {'calibration' if measured else 'extension'} should not be used for prediction unchecked"
+    )
+
+
+def without_interval(causes: Sequence[Cause]) -> str:
+    """Which parameters have none; "" if all have one."""
+    rows = [
+        f"{NAMES.get(c.id, c.id)} ({name})" for c in causes for name, v in c.parameters.items() if not v.interval
+    ]
+    if not rows:
+        return ""
+    return f"no interval for {', '.join(rows)}: what diagnosis.json has as low and high only bounds the search"
+
+
 def _no_base(d: Diagnosis) -> bool:
     """The twin is no good where nothing is hidden either, as far as that was measured."""
     if d.explained is None or d.explained >= POOR:
         return False
     return d.errors.floor is None or d.errors.floor > 0.5 * d.errors.extended.mean
+
+
+def confusions(d: Diagnosis, c: Cause) -> dict[str, list[str]]:
+    """What is often confused with a cause, by what these data say of it; what was found beside it is left out."""
+    measured = {g.id for g in d.gate.causes if g.testable and not g.accepted}
+    screened = {i for seen in d.rounds for i, _ in seen.screened}
+    told, some, no = "Told apart here", "only screened", "not tried here, or not testable"
+    rows: dict[str, list[str]] = {told: [], some: [], no: []}
+    named = {o.id for o in d.causes}
+    for i in LIBRARY[c.id].confounded_with if c.id in LIBRARY else ():
+        if i in named:
+            continue
+        if i in d.not_testable:
+            rows[no].append(i)
+        elif i in d.judged_ids | measured:
+            rows[told].append(i)
+        else:
+            rows[some if i in screened else no].append(i)
+    return rows
 
 
 def not_identifiable(progress: Progress, episodes: Sequence[Episode]) -> list[str]:
