@@ -31,7 +31,7 @@ class DiagnoseConfig:
     back_fit: bool = setting(
         True, doc="no change is what the reference says of a candidate, or a base refined anew; off: the twin as it is"
     )
-    cross_fit: bool = setting(True, doc="train episodes are judged by parameters of a step that leaves their recording out")
+    cross_fit: bool = setting(True, doc="judge train episodes by a step that leaves their recording out")
     chaos_weights: bool = setting(True, doc="residuals count less where perturbed starts spread")
     seed: int = setting(0, low=0, high=2**31 - 1, doc="of places, perturbed starts and sign flips")
 
