@@ -13,7 +13,7 @@ import torch
 from springmass_cases import NOWHERE, holding, line, nobody, particles, state_of, still, zigzag
 from torch import Tensor
 
-from pred_core.effects import LIBRARY
+from pred_core.effects import LIBRARY, confounded
 from pred_core.effects.algebra import Code, Traced, Vec3, where
 from pred_core.effects.effect import HOOKS, BendContext, Effect
 from pred_core.errors import TwinError
@@ -307,3 +307,10 @@ def test_algebra_writes_and_computes_the_same() -> None:
     assert float(law(torch.tensor(1.0), torch.tensor(2.0))) == pytest.approx(-1.5)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="traced"):
         Traced(code, "a") + torch.tensor(1.0)
+
+
+def test_confusion_goes_both_ways() -> None:
+    for id in LIBRARY:
+        assert id not in confounded(id) and len(set(confounded(id))) == len(confounded(id))
+        for other in confounded(id):
+            assert other not in LIBRARY or id in confounded(other)

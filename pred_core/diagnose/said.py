@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pred_core.diagnose.skill import POOR
-from pred_core.effects import LIBRARY
+from pred_core.effects import LIBRARY, confounded
 from pred_core.types import Episode
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def confusions(d: Diagnosis, c: Cause) -> dict[str, list[str]]:
     told, some, no = "Told apart here", "only screened", "not tried here, or not testable"
     rows: dict[str, list[str]] = {told: [], some: [], no: []}
     named = {o.id for o in d.causes}
-    for i in LIBRARY[c.id].confounded_with if c.id in LIBRARY else ():
+    for i in confounded(c.id) if c.id in LIBRARY else ():
         if i in named:
             continue
         if i in d.not_testable:

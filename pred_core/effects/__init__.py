@@ -68,3 +68,9 @@ def find_effect(id: str) -> type[Effect]:
     if id not in LIBRARY:
         raise TwinError(f"unknown effect '{id}'", next_step=nearest(id, LIBRARY))
     return LIBRARY[id]
+
+
+def confounded(id: str) -> tuple[str, ...]:
+    """Ids of the effects that are often mistaken for this one: those it names, then those that name it."""
+    own = find_effect(id).confounded_with
+    return (*own, *(e.id for e in LIBRARY.values() if id in e.confounded_with and e.id not in own))
