@@ -21,7 +21,6 @@ from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.ranking import nothing, ranking
 from pred_core.diagnose.result import Cause, Diagnosis
 from pred_core.diagnose.said import confusions, sentence, unproven, without_interval
-from pred_core.effects import find_effect
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
@@ -147,16 +146,17 @@ def test_only_what_was_judged_is_told_apart(twin: Twin, dragged: list[Episode]) 
     """
     d = answer(twin, dragged)
     told, screened, no = "Told apart here", "only screened", "not tried here, or not testable"
-    assert find_effect("drag_linear").confounded_with == ("drag_quadratic", "wind")
-    assert confusions(d, d.causes[0]) == {told: ["drag_quadratic"], screened: ["wind"], no: []}
+    said = confusions(d, d.causes[0])
+    assert said[told][0] == "drag_quadratic" and said[screened] == ["wind"]
+    assert "friction_viscous" in said[no], "nothing touches a table"
     tip = dataclasses.replace(d.causes[0], id="tip_mass")
     assert confusions(d, tip)[no] == ["mass_gradient", "mass_profile"]
     hardly = dataclasses.replace(d, not_testable={"drag_quadratic": "acts in 2 episodes only"})
-    assert confusions(hardly, d.causes[0])[no] == ["drag_quadratic"]
+    assert "drag_quadratic" in confusions(hardly, d.causes[0])[no]
     slip = dataclasses.replace(d.causes[0], id="grip_slip")  # often taken for an offset of the gripper
     assert "gripper_offset" in confusions(d, slip)[no]
     tested = dataclasses.replace(d, gate=gate_of(GateCause("gripper_offset", False, True, "small")), not_testable={})
-    assert confusions(tested, slip)[told] == ["gripper_offset"]
+    assert "gripper_offset" in confusions(tested, slip)[told]
     seen = dataclasses.replace(d, gate=gate_of(measured("gripper_offset")), not_testable={})
     assert "gripper_offset" not in confusions(seen, slip)[told], "the gate found it"
 
