@@ -22,7 +22,11 @@ SESSION = SessionConfig(train=12, test=4, ood=3, seconds=4.0)
 SETS = ("final", "seen", "dev", "extents")
 SIZED = ("attraction", "sticky_patch", "gripper_slip", "heavy_tip", "stiff_region")  # their size starts a search too
 REFERENCES = (50000, 51000, 52000, 53000)
-SEEN = (29, 106, 34, 64, 78, 102)  # cases of each seen draw that were looked at
+# Draws that were looked at: seeds of the cases from, seed of the draw, controls, how many of its cases.
+SEEN = (
+    (50100, 2, 40, 29), (50200, 3, 42, 106), (50500, 4, 40, 34), (50700, 5, 40, 64), (51100, 6, 40, 78),
+    (51400, 7, 40, 102), (51600, 8, 40, 102),
+)  # fmt: skip
 LEAST, MOST = 2.0, 10.0  # magnitudes, in multiples of the effect's declared minimum, log-uniform
 
 
@@ -86,9 +90,8 @@ def release(which: str) -> Release:
     if which == "dev":
         return _release((7000,), cases(7100, 1, 8, 26, 7, 4))
     if which == "seen":
-        first = (50100, 2, 40), (50200, 3, 42), (50500, 4, 40), (50700, 5, 40), (51100, 6, 40), (51400, 7, 40)
-        drawn = [cases(begin, seed, controls, controls + 6, 10, 6) for begin, seed, controls in first]
-        parts = [_release(REFERENCES, d[:count]) for d, count in zip(drawn, SEEN, strict=True)]
+        drawn = [cases(first, seed, n, n + 6, 10, 6)[:looked] for first, seed, n, looked in SEEN]
+        parts = [_release(REFERENCES, d) for d in drawn]
         return Release(parts[0].references, tuple(c for p in parts for c in p.cases))
     if which == "extents":
         factors = np.exp(np.random.default_rng(9).uniform(np.log(4.0), np.log(MOST), len(SIZED)))
@@ -96,7 +99,7 @@ def release(which: str) -> Release:
         sized = _release(REFERENCES, [(51801 + k, ((n, m),)) for k, (n, m, _) in enumerate(both)])
         found = (dataclasses.replace(c, extent=e) for c, (_, _, e) in zip(sized.cases, both, strict=True))
         return Release(sized.references, tuple(found))
-    return _release(REFERENCES, cases(51600, 8, 40, 46, 10, 6))
+    return _release(REFERENCES, cases(51900, 10, 40, 46, 10, 6))
 
 
 def simulate(root: Path, hidden: Hidden, seed: int, extent: float = 1.0) -> None:
