@@ -78,9 +78,10 @@ def _rope(args: argparse.Namespace) -> int:
 
     session, sensor = _settings(args)
     hidden = hidden_effects(args.effect or [], args.magnitude or [])
-    return _report(write_rope_case(
-            args.out, hidden, args.seed, progress_line(), session=session, sensor=sensor, extent=args.extent
-        ))
+    dataset = write_rope_case(
+        args.out, hidden, args.seed, progress_line(), session=session, sensor=sensor, extent=args.extent
+    )
+    return _report(dataset)
 
 
 def _springs(args: argparse.Namespace) -> int:
