@@ -95,7 +95,8 @@ def release(which: str) -> Release:
         return Release(parts[0].references, tuple(c for p in parts for c in p.cases))
     if which == "extents":
         factors = np.exp(np.random.default_rng(9).uniform(np.log(4.0), np.log(MOST), len(SIZED)))
-        both = [(n, LIBRARY[n].minimum * float(f), e) for n, f in zip(SIZED, factors, strict=True) for e in (0.6, 1.6)]
+        rows = [(LIBRARY[n], float(f)) for n, f in zip(SIZED, factors, strict=True)]
+        both = [(e.name, min(e.minimum * f, e.high), extent) for e, f in rows for extent in (0.6, 1.6)]
         sized = _release(REFERENCES, [(51801 + k, ((n, m),)) for k, (n, m, _) in enumerate(both)])
         found = (dataclasses.replace(c, extent=e) for c, (_, _, e) in zip(sized.cases, both, strict=True))
         return Release(sized.references, tuple(found))
