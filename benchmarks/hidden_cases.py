@@ -85,8 +85,8 @@ def _release(references: tuple[int, ...], drawn: list[tuple[int, Hidden]]) -> Re
 
 
 def release(which: str) -> Release:
-    """One of SETS. "dev": chose what is frozen; "seen": looked at since; "final": what is reported; "extents": what
-    has a size, smaller and larger than where a search for it begins."""
+    """One of SETS. "dev": chose what is frozen; "seen": looked at since; "final": not run before it is reported;
+    "extents": what has a size, smaller and larger than where a search for it begins."""
     if which == "dev":
         return _release((7000,), cases(7100, 1, 8, 26, 7, 4))
     if which == "seen":
