@@ -307,7 +307,7 @@ def test_the_sample_bag_plays_as_live_cameras() -> None:
     color: list[Image] = []
     depth: list[Image] = []
     poses: dict[str, list[PoseStamped]] = {f"cam{k}": [] for k in range(4)}
-    with bench_of(PlayerNode, {"bag": str(CAMERA_SAMPLE), "factor": "4.0", "wait_for": "1"}, feeds=False) as bench:
+    with bench_of(PlayerNode, {"bag": str(CAMERA_SAMPLE), "factor": "1.0", "wait_for": "1"}, feeds=False) as bench:
         hear = bench.world.create_subscription
         hear(Image, "cam2/color/image_raw", color.append, qos.images())
         hear(Image, "cam2/depth/image_raw", depth.append, qos.images())
@@ -316,7 +316,7 @@ def test_the_sample_bag_plays_as_live_cameras() -> None:
         for name, heard in poses.items():
             hear(PoseStamped, f"{name}/pose", heard.append, qos.latched())
         bench.until(lambda: bench.node.exit_code == 0, "the end of the bag")
-        bench.until(lambda: len(color) == 15 and len(depth) == 15, "2.8 s at 5 Hz are 15 pictures")
+        bench.until(lambda: len(color) == 25 and len(depth) == 25, "1.6 s at 15 Hz are 25 pictures")
     assert all(poses.values())
     picture, metres = images.read_color(color[-1], "c"), images.read_depth(depth[-1], "d")
     assert picture.shape == (240, 320, 3) and color[-1].encoding == "rgb8" and depth[-1].encoding == "16UC1"
