@@ -25,7 +25,7 @@ class PlayedPictures:
             kind, profile = _kind(topic), qos.latched() if topic.endswith(f"/{images.POSE}") else qos.points_complete()
             if kind is not None:
                 self._out[topic] = node.create_publisher(
-                    Image if kind is CompressedImage else kind, _live(topic), profile
+                    Image if kind is CompressedImage else kind, images.raw_topic(topic), profile
                 )
 
     @property
@@ -60,8 +60,3 @@ def _kind(topic: str) -> type | None:
     if name in (images.COLOR, images.DEPTH):
         return Image
     return {images.INFO: CameraInfo, images.POSE: PoseStamped}.get(name)
-
-
-def _live(topic: str) -> str:
-    """The topic on which a driver sends what a bag may hold compressed."""
-    return topic.removesuffix("/compressedDepth").removesuffix("/compressed")

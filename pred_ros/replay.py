@@ -18,7 +18,7 @@ from pred_core.bag.measured import find_measured
 from pred_core.bag.playlist import find_clips
 from pred_core.bag.wire import TRACKER_POINTS
 from pred_core.cli.main import INTERRUPTED
-from pred_core.errors import PredError
+from pred_core.errors import ConfigError, PredError
 from pred_ros.commands import run_command
 from pred_ros.live import Replay, replay
 from pred_ros.resources import config_folder, sample_dataset, sample_pictures
@@ -54,6 +54,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run(args: argparse.Namespace) -> int:
     """Choose, prepare, replay, evaluate, and say where everything is. Returns 0. Raises: PredError."""
     source = sample_source() if args.cameras else choose_source(args.dataset, args.settings)
+    if args.settings is not None and (args.cameras or not source.pictures):
+        raise ConfigError(
+            "--settings are the tracker's, for pictures of your own",
+            got=f"{args.settings} for {source.name}",
+            allowed="beside --dataset with a bag of pictures, or a data set of such bags",
+        )
     out = args.out / source.name
     print(f"1. data: {source.name}, {source.origin}: {source.path}", flush=True)
     dataset = prepare_dataset(source, args.out / "datasets" / source.name)

@@ -197,6 +197,9 @@ def test_the_command_line_says_what_is_wrong(tmp_path: Path, capsys: pytest.Capt
     assert main_job.main(["--dataset", str(tmp_path)]) == 2
     line = capsys.readouterr().err.strip()
     assert line.startswith("pred_replay: ") and "\n" not in line
+    for what in (["--cameras"], ["--dataset", str(SAMPLE)]):
+        assert main_job.main([*what, "--settings", "mine.yaml", "--out", str(tmp_path)]) == 2
+        assert "--settings are the tracker's" in capsys.readouterr().err
 
 
 def test_the_sample_is_what_it_says() -> None:

@@ -33,6 +33,11 @@ def optical_frame(camera: str) -> str:
     return f"{camera}_color_optical_frame"
 
 
+def raw_topic(topic: str) -> str:
+    """The topic on which a driver sends what a bag may hold compressed; any other topic as it is."""
+    return topic.removesuffix("/compressedDepth").removesuffix("/compressed")
+
+
 def read_color(message: Any, where: str) -> Color:
     """(H, W, 3) RGB of a colour image. Raises: BagError for another encoding or a wrong size."""
     order = _CHANNELS.get(message.encoding)

@@ -128,7 +128,7 @@ class _Tracking:
         self._waiting: dict[tuple[str, int], Any] = {}  # (camera, stamp) -> colour or depth without its partner
         self._group: dict[str, int] = {}  # camera -> stamp of its picture in the tracker
         self._closed: NDArray[np.bool_] | None = None
-        self._grips: list[int] = []  # [ns]
+        self._gripped = False  # a gripper pose came, and whether it is closed is known
         self._points: list[PointFrame] = []
         self._shown = 0  # pictures of the first camera
         self._count = BagCount(clip.name)
@@ -176,11 +176,12 @@ class _Tracking:
         elif self._closed is not None:
             pose = read_gripper_pose(message, where)
             self._tracker.add_grip(pose.stamp, pose.position, pose.rotation, self._closed)
-            self._grips.append(pose.stamp)
+            self._gripped = True
 
     def _camera(self, timed: Timed) -> None:
         name, _, below = timed.topic.partition("/")
-        if name not in self._cameras or self._raw_of(timed.topic) in self._types:
+        raw = images.raw_topic(timed.topic)
+        if name not in self._cameras or (raw != timed.topic and raw in self._types):  # a bag may have both
             return
         camera = self._cameras[name]
         message = decode(timed.data, self._types[timed.topic], f"{self._clip.path.name}: {timed.topic}")
@@ -191,11 +192,6 @@ class _Tracking:
         elif below in (*_COLOR, *_DEPTH):
             self._shown += name == self._names[0] and below in _COLOR
             self._pair(name, below in _COLOR, message)
-
-    def _raw_of(self, topic: str) -> str:
-        """The raw topic of a compressed one, which is used where a bag has both."""
-        raw = topic.removesuffix("/compressedDepth").removesuffix("/compressed")
-        return raw if raw != topic else ""
 
     def _pair(self, name: str, is_color: bool, message: Any) -> None:
         key = (name, stamp_of(message))
@@ -209,7 +205,7 @@ class _Tracking:
         was_color, other = self._waiting.pop(key)
         if was_color == is_color:
             raise BagError(f"{self._clip.path.name}: two pictures of '{name}' with one stamp", got=f"{key[1]} ns")
-        if not self._grips:  # which end of a line is the first is not known yet, and such a frame could not be used
+        if not self._gripped:  # which end of a line is the first is not known yet, and such a frame could not be used
             return
         if name in self._group:
             self._step()
