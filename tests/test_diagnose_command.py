@@ -3,51 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 import shutil
-from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from plant_cases import hurry
+from diagnose_runs import SPLITS, diagnose, matched, read, refusal, write
 from report_cases import PERIOD, drag, recorded, rope
 
-from pred_core.bag.dataset import EpisodeEntry, write_dataset
-from pred_core.bag.episode import write_episode
-from pred_core.cli.main import main
 from pred_core.diagnose.journal import Journal
-from pred_core.plant.session import SessionConfig
-from pred_core.plant.springs import Line, SpringsConfig, write_springs_case
 from pred_core.pred import load_dynamics
 from pred_core.springmass import build_body
-from pred_core.twin import Twin, TwinMeta
-from pred_core.types import STANDARD_GRAVITY, Array, Episode, ObjectInfo, Physics, Scene, State
-
-SPLITS = ("train",) * 5 + ("test",)
-FAST = ["--places", "4", "--survivors", "3", "--iterations", "6"]
-
-
-def write(
-    root: Path,
-    episodes: Sequence[Episode],
-    rate: float = 30.0,
-    name: str = "rope",
-    gravity: tuple[float, float, float] = STANDARD_GRAVITY,
-) -> Path:
-    """The episodes as a data set of bags."""
-    entries = []
-    for e in episodes:
-        write_episode(root / f"{e.name}.mcap", e)
-        entries.append(EpisodeEntry(f"{e.name}.mcap", e.split, e.recording))
-    write_dataset(
-        root, object=ObjectInfo(name, "line"), rate=rate, entries=entries, held={0: 0}, known={"mass": 0.05},
-        gravity=gravity,
-    )  # fmt: skip
-    return root
+from pred_core.twin import Twin
+from pred_core.types import Episode, State
 
 
 @pytest.fixture(scope="module")
@@ -65,19 +35,11 @@ def world(tmp_path_factory: pytest.TempPathFactory, dragged: list[Episode]) -> P
     return root
 
 
-def diagnose(dataset: Path, twin: Path, out: Path, *flags: str) -> int:
-    return main(["diagnose", str(dataset), "--twin", str(twin), "--out", str(out), *FAST, *flags])
-
-
 @pytest.fixture(scope="module")
 def found(world: Path) -> Path:
     """Where the answer about the dragged rope is."""
     assert diagnose(world / "suspect", world / "twin", world / "out", "--reference", str(world / "reference")) == 0
     return world / "out"
-
-
-def read(out: Path) -> dict[str, Any]:
-    return dict(json.loads((out / "diagnosis.json").read_text()))
 
 
 def test_the_answer_has_what_the_design_says(found: Path) -> None:
@@ -234,17 +196,6 @@ def test_a_gripper_that_stands_still_tests_nothing(world: Path, tmp_path: Path) 
 # Bad input ------------------------------------------------------------------------------------------------------------
 
 
-def refusal(capsys: pytest.CaptureFixture[str], dataset: Path, twin: Path, out: Path, *flags: str) -> str:
-    """The one line of a diagnosis that must fail; lines of progress, "[  1 s] ...", may stand before it."""
-    capsys.readouterr()
-    assert diagnose(dataset, twin, out, *flags) == 2
-    shown = capsys.readouterr()
-    lines = [line for line in shown.err.strip().splitlines() if not line.startswith("[")]
-    assert len(lines) == 1 and lines[0].startswith("pred: ") and not shown.out, shown
-    assert not (out / "diagnosis.json").exists() and not (out / "twin").exists()
-    return lines[0]
-
-
 def test_a_missing_twin_or_data_set(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "not a twin" in refusal(capsys, world / "suspect", tmp_path / "none", tmp_path / "out")
     assert str(tmp_path / "none") in refusal(capsys, tmp_path / "none", world / "twin", tmp_path / "out")
@@ -368,156 +319,3 @@ def test_a_damaged_journal(world: Path, found: Path, tmp_path: Path, capsys: pyt
     against = ("--reference", str(world / "reference"))
     line = refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", *against)
     assert "journal.jsonl: is damaged" in line and "Delete it" in line
-
-
-def tree(root: Path) -> dict[str, bytes]:
-    """Every file under a folder."""
-    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
-
-
-@pytest.mark.parametrize("inside", ["twin", "deep/mine", "link"])
-def test_out_must_not_hold_the_questioned_twin(
-    inside: str, world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The answer's twin is written to OUT/twin: over the one that is questioned, also through a link."""
-    out = tmp_path / "out"
-    if inside == "link":
-        rope().save(tmp_path / "mine")
-        out.mkdir()
-        (out / "twin").symlink_to(tmp_path / "mine")
-        twin = tmp_path / "mine"
-    else:
-        twin = out / inside
-        rope().save(twin)
-    before = tree(tmp_path)
-    assert diagnose(world / "suspect", twin, out, "--reference", str(world / "reference")) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "--out holds the twin that is questioned" in line and f"--twin {twin}" in line
-    assert line.endswith("Give another --out.") and tree(tmp_path) == before
-
-
-def test_out_must_not_hold_a_twin_of_others(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One that `pred identify` wrote there, with nothing of a diagnosis beside it."""
-    rope().save(tmp_path / "twin")
-    before = tree(tmp_path)
-    assert diagnose(world / "suspect", world / "twin", tmp_path) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "a twin that no diagnosis wrote" in line and "move that twin away" in line and tree(tmp_path) == before
-
-
-@pytest.mark.parametrize(
-    ("which", "said"),
-    [("data", "of the data set"), ("reference", "of the reference"), ("twin", "of the twin"),
-     ("data/dataset.yaml", "of the data set")],
-)  # fmt: skip
-def test_out_must_not_be_an_input(
-    which: str, said: str, world: Path, tmp_path: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
-) -> None:
-    write(tmp_path / "data", dragged[:2])
-    shutil.copytree(world / "reference", tmp_path / "reference")
-    rope().save(tmp_path / "twin")
-    before = tree(tmp_path)
-    folder, _, file = which.partition("/")
-    data = tmp_path / "data" / file  # a data set may be given by its dataset.yaml
-    out = tmp_path / "data" / ".." / folder
-    assert diagnose(data, tmp_path / "twin", out, "--reference", str(tmp_path / "reference")) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert f"--out is the folder {said}" in line and line.endswith("Give another --out.") and tree(tmp_path) == before
-
-
-def test_a_data_set_where_the_answers_twin_goes(
-    tmp_path: Path, world: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
-) -> None:
-    write(tmp_path / "twin", dragged[:2])
-    before = tree(tmp_path)
-    assert diagnose(tmp_path / "twin", world / "twin", tmp_path) == 2
-    assert "would be written into the data set" in capsys.readouterr().err and tree(tmp_path) == before
-
-
-def test_a_reference_with_bags_of_the_data_set(
-    world: Path, tmp_path: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The data set itself shows no change; nor does one that holds some of its recordings, under whatever name."""
-    itself = ("--reference", str(world / "suspect"))
-    line = refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", *itself)
-    assert "got 6 of 6 bags in both: ep0.mcap, ep1.mcap, ep2.mcap, ep3.mcap, ep4.mcap and 1 more" in line
-    assert "Give another --reference, or leave it out" in line
-    old = recorded(rope(), (), SPLITS, seed=100, frames=40)
-    mixed = write(tmp_path / "mixed", [*old[:4], dataclasses.replace(old[4], name="again"), old[5]])
-    shutil.copy(world / "suspect" / "ep2.mcap", mixed / "again.mcap")
-    line = refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", "--reference", str(mixed))
-    assert "got 1 of 6 bags in both: ep2.mcap (there again.mcap);" in line
-
-
-def test_a_gravity_that_contradicts(
-    world: Path, tmp_path: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """1 % of 9.81 m/s^2 is allowed, as vectors: 9.80 or a tilt of half a degree pass, of a degree (0.17) do not."""
-    up, out = write(tmp_path / "up", dragged[:2], gravity=(0.0, 0.0, 9.81)), tmp_path / "out"
-    line = refusal(capsys, up, world / "twin", out)
-    assert f"[0, 0, 9.81] m/s^2 in dataset.yaml, [0, 0, -9.81] m/s^2 in {world / 'twin' / 'twin.yaml'}" in line
-    assert "Correct 'gravity' in dataset.yaml, or identify the twin on this data: pred identify" in line
-    line = refusal(capsys, world / "suspect", world / "twin", out, "--reference", str(up))
-    assert line.startswith(f"pred: reference {up}: its gravity contradicts the data set's") and "[0, 0, 9.81]" in line
-    line = refusal(capsys, up, world / "twin", out, "--reference", str(world / "reference"))
-    assert "the twin's" in line
-    line = refusal(capsys, write(tmp_path / "lean", dragged[:2], gravity=(0.1712, 0.0, -9.8085)), world / "twin", out)
-    assert "[0.1712, 0, -9.8085]" in line
-    rope().replace(scene=Scene(gravity=(0.08, 0.0, -9.80))).save(tmp_path / "twin")  # 0.081 apart
-    still = [dataclasses.replace(e, split="ood") for e in dragged[:2]]  # the next thing that is wrong is told
-    assert "'train'" in refusal(capsys, write(tmp_path / "near", still), tmp_path / "twin", out)
-
-
-# Another world of springs, in which the twin can be right -------------------------------------------------------------
-
-PARTICLES = 10
-SPRINGS = SpringsConfig(stiffness=60.0, damping=0.03, friction=0.5, reach=2, substeps=12)
-PLANTED = 3.0  # [1/s]
-
-
-def matched() -> Twin:
-    """The twin with the world's own parameters."""
-    spacing = SPRINGS.length / (PARTICLES - 1)
-    physics = Physics(
-        stiffness=SPRINGS.stiffness, damping=SPRINGS.damping, connection_threshold=2.5 * spacing, max_springs=4,
-        ground_friction=SPRINGS.friction,
-    )  # fmt: skip
-    rest = np.zeros((PARTICLES, 3))
-    rest[:, 0] = spacing * np.arange(PARTICLES)
-    body = build_body("line", rest, SPRINGS.mass, physics)
-    return Twin(TwinMeta(object=ObjectInfo("rope", "line"), period=1.0 / 30.0), body, physics, Scene(ground=0.0))
-
-
-@pytest.fixture(scope="module")
-def springs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """`twin`; data sets `reference`, `control` and `drag` of seven episodes of 2 s, each of other motions."""
-    root = tmp_path_factory.mktemp("springs")
-    matched().save(root / "twin")
-    session = SessionConfig(train=5, test=2, ood=0, seconds=2.0, particles=PARTICLES)
-    step = Line.step
-    with pytest.MonkeyPatch.context() as patch:
-        hurry(patch)
-        for seed, name in ((40, "reference"), (41, "control"), (43, "drag")):
-
-            def dragging(self: Line, x: Array, v: Array, held: Array, drag: float, h: float) -> tuple[Array, Array]:
-                return step(self, x, v, held, drag or PLANTED, h)
-
-            patch.setattr(Line, "step", dragging if name == "drag" else step)
-            write_springs_case(root / name, seed, lambda *_: None, session=session, springs=SPRINGS)
-    yield root
-
-
-def test_nothing_is_named_where_nothing_is_hidden(springs: Path, tmp_path: Path) -> None:
-    assert diagnose(springs / "control", springs / "twin", tmp_path, "--reference", str(springs / "reference")) == 0
-    d = read(tmp_path)
-    assert d["outcome"] == "none" and d["causes"] == [] and d["exploratory"] is True
-    assert "Nothing is found" in d["sentence"] and not Twin.load(tmp_path / "twin").extensions
-
-
-def test_drag_is_named_in_a_world_of_other_code(springs: Path, tmp_path: Path) -> None:
-    """Float64, finer steps, noise, drop-outs and jitter of a tracker; exploratory: 10 % from seven short episodes."""
-    assert diagnose(springs / "drag", springs / "twin", tmp_path, "--reference", str(springs / "reference")) == 0
-    d = read(tmp_path)
-    assert d["outcome"] in ("named", "group") and d["exploratory"] is True
-    assert d["causes"][0]["id"] == "drag_linear"
-    assert d["causes"][0]["parameters"]["coefficient"]["value"] == pytest.approx(PLANTED, rel=0.1)
