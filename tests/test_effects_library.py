@@ -87,6 +87,7 @@ def test_declaration_is_complete_and_bounds_hold(effect: type[Effect]) -> None:
 STRONG: dict[str, dict[str, float | tuple[float, ...]]] = {
     "drag_linear": {"coefficient": 20.0},
     "drag_quadratic": {"coefficient": 20.0},
+    "drag_power": {"coefficient": 20.0, "power": 3.0},
     "gravity_offset": {"acceleration": (3.0, -3.0, 3.0)},
     "bending_damping": {"time": 0.3},
     "bending_hysteresis": {"ratio": 10.0, "reach": 0.3},
@@ -107,6 +108,7 @@ STRONG: dict[str, dict[str, float | tuple[float, ...]]] = {
     "obstacle": {"radius": 0.1, "center": (0.3, 0.0, -0.15)},
     "friction_scale": {"change": 5.0},
     "friction_viscous": {"coefficient": 50.0},
+    "friction_power": {"coefficient": 50.0, "power": 2.0},
     "friction_anisotropic": {"components": (2.0, -2.0)},
     "friction_patch": {"change": 20.0, "radius": 0.5},
     "table_height": {"height": 0.1},

@@ -88,6 +88,8 @@ def _outcome(causes: Sequence[Cause], progress: Progress) -> str:
     physics = [c for c in causes if not c.measured]
     cold = progress.bench.reference is None  # nobody knows there how much there is to explain
     least = progress.bench.config.enough if cold else PARTLY
+    if physics and physics[0].contradicted:  # only the nearest law
+        return "unknown"
     if progress.unknown and max((c.closed or 0.0 for c in physics), default=0.0) < least:
         return "unknown"
     if not causes:

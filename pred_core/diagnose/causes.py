@@ -62,7 +62,7 @@ def _named(n: Named, probability: Mapping[str, float], single: bool) -> list[Cau
                 j.values[knob.name], knob.unit, low, high, j.at_bound[knob.name],
                 interval=not single and (low, high) != (knob.low, knob.high),
             )  # fmt: skip
-        rows.append(Cause(id, effect.family, sure, values, False, n.closed, n.p_adjusted, n.group))
+        rows.append(Cause(id, effect.family, sure, values, False, n.closed, n.p_adjusted, n.group, n.contradicted))
     return rows
 
 

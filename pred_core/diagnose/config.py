@@ -18,7 +18,7 @@ class DiagnoseConfig:
     level: float = setting(0.05, low=1e-4, high=0.5, doc="family-wise error of a name")
     gate: float = setting(0.1, low=0.0, high=1.0, doc="least share of the excess error closed, with a reference")
     cold_gate: float = setting(0.25, low=0.0, high=1.0, doc="the same without a reference")
-    improved: float = setting(0.75, low=0.0, high=1.0, doc="least share of the episodes it acts in that improve")
+    improved: float = setting(0.75, low=0.0, high=1.0, doc="share of the episodes it acts in that must not get worse")
     enough: float = setting(
         0.6, low=0.0, high=1.0, doc="share of the excess closed below which pairs are tried; cold: the rest is unknown"
     )

@@ -17,6 +17,7 @@ FLIPS = 20_000
 DIGITS = 9  # of a sum of gains, as a share of their sizes: the unflipped draw must count, whatever its rounding
 FEWEST_GROUPS = 10  # 2^-10 is the smallest p value they can show; with six a single quiet one decides
 ACTS = 0.1  # standard deviations of a residual by which a cause must move an episode to count as acting in it
+SLIGHT = 0.05  # of the mean gain: an episode that loses less is not worse
 NESTED = 0.06  # of the best gain: with fewer parameters, so little less is the better name
 SIMILAR = 0.1  # the same where it is also within one standard error
 CONFIDENCE = 0.90  # of the set of causes that cannot be told apart
@@ -57,6 +58,11 @@ class Judged:
     def improved(self) -> tuple[int, int]:
         """(episodes that improve, episodes in which it acts)."""
         return int((self.gain[self.acts] > 0).sum()), int(self.acts.sum())
+
+    @property
+    def worse(self) -> int:
+        """Episodes it acts in that lose more than SLIGHT of the mean gain: less is no vote against it."""
+        return int((self.gain[self.acts] < -SLIGHT * self.mean).sum())
 
     @property
     def at_bound(self) -> dict[str, bool]:

@@ -27,7 +27,7 @@ from pred_core.types import Array, Episode
 FEWEST = 10  # train episodes that the gate's intervals are made for
 SMALLEST = 3e-4  # [m] at the object: less is not worth a name
 SMALLEST_SLIDE = 3e-3  # [m]
-OTHERS = 3  # tests besides the sensors': slide, table height, table tilt
+OTHERS = 4  # tests besides the sensors': slide, table height, tilt and relief
 
 __all__ = ["GateCause", "GateResult", "measure"]
 

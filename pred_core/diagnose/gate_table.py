@@ -29,6 +29,8 @@ class Plane:
     covariance: Array  # (3, 3)
     episodes: int
     extent: Array  # (2,) [m] standard deviation of the resting points' x, y
+    spread: float  # [m] of the resting points beside it: the median deviation as a normal standard deviation
+    spreads: Array  # (episodes,) [m] the same of each episode by itself
 
 
 def resting_points(episode: Episode, sigma: float) -> Array:
@@ -54,19 +56,23 @@ def resting_points(episode: Episode, sigma: float) -> Array:
 
 
 def fit_plane(episodes: Sequence[Episode], sigma: float, middle: Array | None = None) -> Plane | None:
-    """The plane that particles rest on; None if too few rest, or not on one plane."""
+    """The plane nearest to what rests; None if too little does."""
     points = [p for p in (resting_points(e, sigma) for e in episodes) if len(p)]
     if len(points) < FEWEST:
         return None
     everything = np.concatenate(points)
     where = everything[:, :2].mean(axis=0) if middle is None else middle
     value, residual = _plane(everything, where)
-    if 1.4826 * float(np.median(np.abs(residual))) > max(FLAT, sigma):
-        return None
+    pieces = np.split(residual, np.cumsum([len(p) for p in points])[:-1])
     parts = [_plane(np.concatenate(points[:k] + points[k + 1 :]), where)[0] for k in range(len(points))]
     off = np.array(parts) - np.mean(parts, axis=0)
     covariance = (len(points) - 1) / len(points) * off.T @ off + 1e-10 * np.diag([1.0, 1.0, 1.0])
-    return Plane(where, value, covariance, len(points), everything[:, :2].std(axis=0))
+    spreads = np.array([_spread(r) for r in pieces])
+    return Plane(where, value, covariance, len(points), everything[:, :2].std(axis=0), _spread(residual), spreads)
+
+
+def _spread(residual: Array) -> float:
+    return max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
 
 
 def compare(value: Array, covariance: Array, part: slice, freedom: int) -> tuple[float, Array]:

@@ -1,17 +1,19 @@
-"""Table height and tilt as causes: against the reference's table, else against the twin's."""
+"""Height, tilt and relief of the table as causes: against the reference's table, else against the twin's."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.stats import ttest_ind
 
 from pred_core.diagnose.gate_result import GateCause
 from pred_core.diagnose.gate_select import LEVEL
-from pred_core.diagnose.gate_table import compare, fit_plane
+from pred_core.diagnose.gate_table import FLAT, Plane, compare, fit_plane
 from pred_core.types import Episode
 
-TABLE_CAUSES = ("table_height", "table_tilt")
+PLANE_CAUSES = ("table_height", "table_tilt")
+RELIEF = "table_relief"
 SMALLEST_CHANGE = 5e-4  # [m] against a reference
 SMALLEST_ABSOLUTE = 2e-3  # [m] against the twin's plane: the particles' radius is not known better
 LONG_ENOUGH = 0.05  # [m] deviation of the resting points along an axis from which on a tilt shows
@@ -25,15 +27,51 @@ def table_causes(
     sigma: float,
     family: int,
 ) -> list[GateCause]:
-    """Height [m] and slope of the plane that particles rest on, as changes. family: tests that Holm corrects for."""
+    """Height [m] and slope of the plane that particles rest on, and how far they rest off it [m], as changes.
+    family: tests that Holm corrects for.
+    """
     before = fit_plane(reference, sigma) if reference else None
     plane = fit_plane(suspect, sigma, None if before is None else before.middle)
     if plane is None or (reference and before is None):
-        return [GateCause(i, False, False, "too few particles rest on one plane while the gripper moves")
-                for i in TABLE_CAUSES]  # fmt: skip
+        return _not_testable("too few particles rest while the gripper moves", RELIEF, *PLANE_CAUSES)
     if before is None and ground is None:
         why = f"the twin has no table; particles rest at {1e3 * plane.value[0]:.1f} mm"
-        return [GateCause(i, False, False, why) for i in TABLE_CAUSES]
+        return _not_testable(why, RELIEF, *PLANE_CAUSES)
+    relief = _relief(plane, before, sigma, family)
+    if any(p is not None and p.spread > max(FLAT, sigma) for p in (plane, before)):
+        return [*relief, *_not_testable("what rests does not lie on one plane", *PLANE_CAUSES)]
+    return [*relief, *_plane_causes(plane, before, ground, radius, sigma, family)]
+
+
+def _not_testable(why: str, *ids: str) -> list[GateCause]:
+    return [GateCause(i, False, False, why) for i in ids]
+
+
+def _relief(plane: Plane, before: Plane | None, sigma: float, family: int) -> list[GateCause]:
+    """Whether particles rest farther off their plane than in the reference: Welch's test on logs of the episodes."""
+    if before is None:
+        return _not_testable("needs a reference: how far particles rest off a plane depends on the tracks", RELIEF)
+    p = float(ttest_ind(np.log(plane.spreads), np.log(before.spreads), equal_var=False, alternative="greater").pvalue)
+    size = float(np.sqrt(max(plane.spread**2 - before.spread**2, 0.0)))
+    smallest = max(SMALLEST_CHANGE, 0.5 * sigma)
+    return [
+        GateCause(
+            id=RELIEF,
+            accepted=min(1.0, family * p) <= LEVEL and size >= smallest,
+            testable=True,
+            why=f"particles rest {1e3 * plane.spread:.2f} mm off it, in the reference {1e3 * before.spread:.2f} mm",
+            unit="m",
+            parameters={"relief": (size,)},
+            p_value=p,
+            p_adjusted=min(1.0, family * p),
+            effect_mm=1e3 * size,
+        )
+    ]
+
+
+def _plane_causes(
+    plane: Plane, before: Plane | None, ground: float | None, radius: float, sigma: float, family: int
+) -> list[GateCause]:
     expected = np.array([(ground or 0.0) + radius, 0.0, 0.0]) if before is None else before.value
     covariance = plane.covariance if before is None else plane.covariance + before.covariance
     freedom = plane.episodes - 1 + (0 if before is None else before.episodes - 1)

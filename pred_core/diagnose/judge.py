@@ -186,7 +186,7 @@ def _judged(trial: Trial, episodes: int, values: Mapping[str, Any]) -> Judged:
         trial=trial,
         values=trial.space.values(z),
         null=trial.space.values(null),
-        intervals=_intervals(trial, z, null, np.stack([vector(p, size) for p in values["left_out"]])),
+        intervals=intervals(trial, z, null, np.stack([vector(p, size) for p in values["left_out"]])),
         gain=vector(values["gain"], episodes),
         acts=vector(values["moved"], episodes) > ACTS,
         extended=vector(values["extended"], episodes),
@@ -219,7 +219,7 @@ def _judge(bench: Bench, screened: Screened) -> dict[str, object]:
     }
 
 
-def _intervals(trial: Trial, z: Array, null: Array, left_out: Array) -> dict[str, tuple[float, float]]:
+def intervals(trial: Trial, z: Array, null: Array, left_out: Array) -> dict[str, tuple[float, float]]:
     """90 %, as values: the jackknife over recordings (Efron 1982) and what simulations of one rope differ by."""
     groups = len(left_out)
     if groups < 2:

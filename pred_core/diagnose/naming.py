@@ -13,7 +13,6 @@ from pred_core.diagnose.progress import Named, Progress
 LEFT = 0.25  # of the floor: an excess that is called unknown if nothing explains it
 FEWEST = 10  # episodes for inference; fewer are exploratory
 HALF = 0.5  # of the least gain: a cause must save so much beside "off" too, whatever the reference says of it
-SLIGHT = 0.05  # of the mean gain: an episode that loses less is not worse
 EXPLORATORY = 0.5  # share of the excess a cause must close to be named from fewer
 BETTER = 0.1  # of the gain of a simpler law that one with more parameters must save beyond it to be its rival
 STANDING = 0.1  # of the floor: a gain below is not worth a name, whatever its significance: bases differ by 0.07
@@ -77,11 +76,10 @@ def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress
     least = max((config.cold_gate if cold else config.gate) * whole, STANDING * floor)
     if without - j.left < HALF * least:  # what it saves beside the reference's value is not saved beside "off"
         return f"leaves {j.left:.3f} of the loss, where {without:.3f} are left without it"
-    better, acting = j.improved
+    acting = int(j.acts.sum())
     if exploratory(progress.bench):  # no inference: what helps everywhere, and much, is named as exploratory
-        worse = int((j.gain[j.acts] < -SLIGHT * j.mean).sum())
-        if acting == 0 or worse:
-            return f"{worse} of {acting} episodes get worse"
+        if acting == 0 or j.worse:
+            return f"{j.worse} of {acting} episodes get worse"
         return "" if j.mean >= max(EXPLORATORY * whole, least) else f"saves too little ({j.mean:.3f} of the loss)"
     if acting < 4:
         return f"acts in {acting} episodes only"
@@ -89,8 +87,8 @@ def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress
         return f"not significant (adjusted p {p:.3f})"
     if j.mean < least:
         return f"saves too little ({j.mean:.3f} of the loss, {least:.3f} needed)"
-    if better < config.improved * acting:
-        return f"{better} of {acting} episodes improve"
+    if j.worse > (1.0 - config.improved) * acting:
+        return f"{j.worse} of {acting} episodes get worse"
     if not j.excludes_null:
         return "its interval includes no change"
     return ""

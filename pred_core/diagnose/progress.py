@@ -23,6 +23,7 @@ class Named:
     group: tuple[str, ...]  # others that these data do not tell apart from it
     closed: float  # share of the excess of its round that it closes
     round: int
+    contradicted: str = ""  # what the data say against its law: it is only the nearest one; "" where they do not
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,16 @@ class Progress:
         self.named.append(named)
         self.bench = bench
         self.twins.append(bench.twin)
+
+    def replace(self, named: Named, instead: Named, bench: Bench) -> None:
+        """Put another law, fitted with all that was named, in the place of one that the data contradict."""
+        seen = self.rounds[named.round]
+        judged = tuple((j, p, instead.contradicted if j is named.judged else why) for j, p, why in seen.judged)
+        judged = (*judged, (instead.judged, instead.p_adjusted, ""))
+        self.rounds[named.round] = dataclasses.replace(seen, judged=judged)
+        self.named = [instead if n is named else refitted(n, instead.judged) for n in self.named]
+        self.bench = bench
+        self.twins[-1] = bench.twin
 
     def withdraw(self, bench: Bench) -> None:
         """Take back the last name and its round: the bench is as it was before."""

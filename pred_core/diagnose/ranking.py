@@ -13,7 +13,7 @@ from pred_core.diagnose.result import Ranked
 SHARP = 1.0  # how fast a rival's weight falls with the standard errors it is behind
 OCCAM = 0.5  # weight of a rival for each parameter that it has beyond the best one's
 COLD = 0.8  # without a reference: what engine and object lack in common can look like a cause
-UNSEEN = 0.05  # probability left for "none" where something is seen that no candidate explains
+UNSEEN = 0.05  # probability left for "none" where no candidate explains what is seen, and for a law the data contradict
 FOUND = 0.88, 0.05  # share of hidden effects (75 of 85 seen cases) that give a family-wise p below this
 EXPLAINS = (0.45, 8.0)  # share of the excess closed at which "it explains it" is even, and how steeply that rises
 
@@ -39,6 +39,8 @@ def nothing(p: float) -> float:
 
 def confidence(named: Named, floor: bool) -> float:
     """Probability that a name stands for what is there. Without a floor nobody knows how much there is to explain."""
+    if named.contradicted:
+        return UNSEEN
     return explains(named.closed) if floor else COLD
 
 

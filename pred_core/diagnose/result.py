@@ -40,6 +40,7 @@ class Cause:
     closed: float | None = 0.0
     p_adjusted: float = 1.0
     group: tuple[str, ...] = ()  # these data do not tell it apart from
+    contradicted: str = ""  # what the data say against its law, the nearest there is; "" where they do not
 
 
 @dataclass(frozen=True)
@@ -146,6 +147,7 @@ def _cause(c: Cause) -> dict[str, Any]:
         "closed": c.closed,
         "p_adjusted": c.p_adjusted,
         "group": list(c.group),
+        "contradicted": c.contradicted,
         "parameters": {
             k: {"value": v.value, "unit": v.unit, "low": v.low, "high": v.high, "at_bound": v.at_bound}
             for k, v in c.parameters.items()

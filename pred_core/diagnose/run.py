@@ -11,6 +11,7 @@ from pred_core.diagnose.answer import Study, answer
 from pred_core.diagnose.commission import commission
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.fits import check_tracks
+from pred_core.diagnose.form import check_forms, check_table
 from pred_core.diagnose.gate import measure
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Tell
@@ -78,7 +79,9 @@ def diagnose(
         took, needed = time.monotonic() - started, needs
         found = progress.named[-1]
         tell(f"named: {found.judged.trial.id}, closes {found.closed:.0%} of the excess")
+    check_forms(progress, tell)
     finish(progress)
+    check_table(progress, gate)
     study = Study(tuple(episodes), tuple(corrected), tuple(known), twin, gate, bench, session)
     return answer(study, progress, begin, tell)
 

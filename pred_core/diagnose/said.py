@@ -18,15 +18,18 @@ if TYPE_CHECKING:
 NAMES = {
     "bending_by_angle": "resistance to bending by angle, instead of springs that skip particles",
     "rest_curvature": "a rest curvature that varies along the object",
-    "drag_linear": "air drag", "drag_quadratic": "quadratic air drag", "gravity_offset": "another gravity direction",
+    "drag_linear": "air drag", "drag_quadratic": "quadratic air drag", "drag_power": "air drag with another power",
+    "gravity_offset": "another gravity direction",
     "length_drift": "length that drifts over the session", "length_scale": "another length",
     "stretch_scale": "another axial stiffness", "strain_stiffening": "stiffening with stretch",
     "bending_stiffening": "stiffening with bending",
     "bending_damping": "damping in bending", "bending_hysteresis": "dry friction inside the cable", "wind": "wind",
     "attraction": "a force towards a place", "tether": "a thread to a fixed point", "obstacle": "an obstacle",
     "friction_scale": "another friction coefficient", "friction_viscous": "viscous friction on the table",
+    "friction_power": "friction that grows with another power of the speed",
     "friction_anisotropic": "friction that depends on the direction", "friction_patch": "a patch of other friction",
-    "table_height": "another table height", "table_tilt": "a tilted table", "tip_mass": "mass at the tip",
+    "table_height": "another table height", "table_tilt": "a tilted table",
+    "table_relief": "a table that is not flat", "tip_mass": "mass at the tip",
     "mass_gradient": "mass that changes along the object", "bending_scale": "another bending stiffness",
     "bending_region": "a piece of other stiffness", "bending_gradient": "stiffness that changes along the object",
     "friction_drift": "friction that drifts over the session",
@@ -69,11 +72,17 @@ def sentence(d: Diagnosis) -> str:
     if d.outcome == "unknown" and _no_base(d):
         share = f"{max(d.explained or 0.0, 0.0):.0%} of the motion"
         return f"{label}Your twin explains {share}, too little to tell what it lacks: identify it anew; {numbers}."
+    near = next((c for c in d.causes if c.contradicted), None)
+    if d.outcome == "unknown" and near is not None:
+        return (
+            f"{label}Your simulation lacks something whose law no candidate has. The nearest is {called(near)}, but "
+            f"{near.contradicted}; with it {numbers}."
+        )
     if d.outcome == "unknown":
-        near = ", ".join(NAMES.get(c.id, c.id) for c in d.causes)
-        partly = f" ({near} explains a part)" if near else ""
+        some = ", ".join(NAMES.get(c.id, c.id) for c in d.causes)
+        partly = f" ({some} explains a part)" if some else ""
         return f"{label}Your simulation lacks something that no candidate explains{partly}; {numbers}."
-    what = "; and ".join(called(c) for c in d.causes)
+    what = "; and ".join(called(c) + (f" (nearly: {c.contradicted})" if c.contradicted else "") for c in d.causes)
     group = tuple(g for c in d.causes for g in c.group)
     unsure = f" (or {', '.join(NAMES.get(g, g) for g in group)}: these data do not tell)" if group else ""
     more = " Something else is left that no candidate explains." if d.more else ""

@@ -11,7 +11,7 @@ from pred_core.identify.space import SearchSpace, search_space
 from pred_core.twin import Twin
 
 # Effects that are measurement (corrected, not simulated) or too flexible to be a name: they would explain anything.
-NOT_A_NAME = ("bending_profile", "mass_profile", "rest_curvature")
+NOT_A_NAME = ("bending_profile", "mass_profile", "rest_curvature", "drag_power", "friction_power")
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from pred_core.errors import TwinError, nearest
 IDS = (
     "drag_linear",
     "drag_quadratic",
+    "drag_power",
     "gravity_offset",
     "bending_damping",
     "bending_hysteresis",
@@ -23,6 +24,7 @@ IDS = (
     "obstacle",
     "friction_scale",
     "friction_viscous",
+    "friction_power",
     "friction_anisotropic",
     "friction_patch",
     "table_height",

@@ -136,6 +136,11 @@ def exp(a: Any) -> Any:
     return a.code.emit(f"lane_exp({a.name})") if isinstance(a, Traced) else torch.exp(torch.as_tensor(a))
 
 
+def log(a: Any) -> Any:
+    """Natural logarithm of a positive scalar."""
+    return a.code.emit(f"lane_log({a.name})") if isinstance(a, Traced) else torch.log(torch.as_tensor(a))
+
+
 def sin(a: Any) -> Any:
     """Sine of an angle [rad]."""
     return a.code.emit(f"lane_sin({a.name})") if isinstance(a, Traced) else torch.sin(torch.as_tensor(a))

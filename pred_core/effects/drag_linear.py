@@ -7,6 +7,7 @@ from typing import Any
 
 from pred_core.effects.algebra import Vec3
 from pred_core.effects.effect import Effect, Parameter, ParticleContext
+from pred_core.types import Physics
 
 
 class DragLinear(Effect):
@@ -17,6 +18,11 @@ class DragLinear(Effect):
     hooks = ("force",)
     parameters = (Parameter("coefficient", "1/s", 0.0, 50.0, typical=0.5, doc="rate b at which free motion decays"),)
     confounded_with = ("drag_quadratic", "wind")
+    form = "drag_power"
+
+    @classmethod
+    def in_form(cls, p: Mapping[str, tuple[float, ...]], physics: Physics) -> dict[str, tuple[float, ...]]:
+        return {"coefficient": p["coefficient"], "power": (1.0,)}
 
     @classmethod
     def force(cls, p: Mapping[str, Any], at: ParticleContext) -> Vec3:

@@ -7,6 +7,7 @@ from typing import Any
 
 from pred_core.effects.algebra import Vec3
 from pred_core.effects.effect import Effect, Parameter, ParticleContext
+from pred_core.types import Physics
 
 FASTEST = 5.0  # [m/s] the speed up to which the simulation must stay stable; hands and arms are slower
 
@@ -19,6 +20,11 @@ class DragQuadratic(Effect):
     hooks = ("force",)
     parameters = (Parameter("coefficient", "1/m", 0.0, 50.0, typical=0.5, doc="b, drag per mass and squared speed"),)
     confounded_with = ("drag_linear", "wind")
+    form = "drag_power"
+
+    @classmethod
+    def in_form(cls, p: Mapping[str, tuple[float, ...]], physics: Physics) -> dict[str, tuple[float, ...]]:
+        return {"coefficient": p["coefficient"], "power": (2.0,)}
 
     @classmethod
     def force(cls, p: Mapping[str, Any], at: ParticleContext) -> Vec3:

@@ -15,7 +15,7 @@ import numpy as np
 from pred_core.effects.algebra import Vec3
 from pred_core.errors import TwinError, nearest
 from pred_core.twin import Extension
-from pred_core.types import Array
+from pred_core.types import Array, Physics
 
 HOOKS = ("boundary", "inertia", "spring", "bend", "rest_shape", "bend_stiffness", "contact", "force", "observe")
 
@@ -143,7 +143,14 @@ class Effect:
     line_values: ClassVar[int] = 0  # values a `bend` hook hands on along a line, from bend to bend
     grip_memory: ClassVar[int] = 0  # values a `boundary` hook keeps per held particle, moved on by `slide`
     reads_tangent: ClassVar[bool] = False  # its `force` hook reads `ParticleContext.tangent`
+    # Another effect whose `power` makes this law one of many: what a diagnosis checks the law's form by.
+    form: ClassVar[str] = ""
     end_twist: ClassVar[str] = ""  # the parameter [rad] by which a line's far material axes are turned in its gripper
+
+    @classmethod
+    def in_form(cls, p: Mapping[str, tuple[float, ...]], physics: Physics) -> dict[str, tuple[float, ...]]:
+        """Parameters of the effect `form` that are the same law."""
+        raise NotImplementedError(f"{cls.id} is of no form")
 
     @classmethod
     def force(cls, p: Mapping[str, Any], at: ParticleContext) -> Vec3:

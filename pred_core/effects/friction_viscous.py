@@ -7,6 +7,7 @@ from typing import Any
 
 from pred_core.effects.algebra import Vec3
 from pred_core.effects.effect import ContactContext, Effect, Parameter
+from pred_core.types import Physics
 
 
 class FrictionViscous(Effect):
@@ -17,6 +18,11 @@ class FrictionViscous(Effect):
     hooks = ("contact",)
     parameters = (Parameter("coefficient", "s/m", 0.0, 100.0, typical=1.0, doc="c, coefficient added per speed"),)
     confounded_with = ("friction_scale", "drag_linear")
+    form = "friction_power"
+
+    @classmethod
+    def in_form(cls, p: Mapping[str, tuple[float, ...]], physics: Physics) -> dict[str, tuple[float, ...]]:
+        return {"coefficient": p["coefficient"], "power": (1.0,)}
 
     @classmethod
     def contact(cls, p: Mapping[str, Any], at: ContactContext) -> tuple[Any, Any]:

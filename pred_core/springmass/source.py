@@ -14,6 +14,7 @@ PRELUDE = r"""
   auto lane_sqrt = [](Lane a) -> Lane { return sqrtf(a); };
   auto lane_select = [](bool c, Lane a, Lane b) -> Lane { return c ? a : b; };
   auto lane_exp = [](Lane a) -> Lane { return expf(a); };
+  auto lane_log = [](Lane a) -> Lane { return logf(a); };
   auto lane_round = [](Lane a) -> Lane { return rintf(a); };
   auto lane_sin = [](Lane a) -> Lane { return sinf(a); };
   auto lane_cos = [](Lane a) -> Lane { return cosf(a); };
@@ -88,6 +89,7 @@ VECTOR_FUNCTIONS = r"""
   auto lane_sqrt = [](Lane a) -> Lane { return __builtin_elementwise_sqrt(a); };
   auto lane_select = [](auto c, Lane a, Lane b) -> Lane { return c ? a : b; };
   auto lane_exp = [](Lane a) -> Lane { for (int k = 0; k < LANES; ++k) a[k] = expf(a[k]); return a; };
+  auto lane_log = [](Lane a) -> Lane { for (int k = 0; k < LANES; ++k) a[k] = logf(a[k]); return a; };
   auto lane_round = [](Lane a) -> Lane { return __builtin_elementwise_rint(a); };
   auto lane_sin = [](Lane a) -> Lane { for (int k = 0; k < LANES; ++k) a[k] = sinf(a[k]); return a; };
   auto lane_cos = [](Lane a) -> Lane { for (int k = 0; k < LANES; ++k) a[k] = cosf(a[k]); return a; };
