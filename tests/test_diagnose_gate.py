@@ -144,9 +144,13 @@ def test_the_result_is_json() -> None:
 
 @pytest.fixture(scope="module")
 def ropes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Episode]]:
-    """MuJoCo ropes of two seeds: nothing hidden; the rope slips over a table that is higher."""
-    root, session = tmp_path_factory.mktemp("ropes"), SessionConfig(train=6, test=0, ood=0, seconds=3.0)
-    cases = {"plain": (), "both": (("gripper_slip", 2.5), ("table_height", 0.012))}
+    """MuJoCo ropes of three seeds: nothing hidden; the rope slips over a table that is higher; ridges in the table."""
+    root, session = tmp_path_factory.mktemp("ropes"), SessionConfig(train=10, test=0, ood=0, seconds=3.0)
+    cases = {
+        "plain": (),
+        "both": (("gripper_slip", 2.5), ("table_height", 0.012)),
+        "ridges": (("table_wave", 0.02),),
+    }
     return {
         name: list(write_rope_case(root / name, hidden, 40 + k, lambda *_: None, session=session).episodes("train"))
         for k, (name, hidden) in enumerate(cases.items())
@@ -159,6 +163,15 @@ def test_what_another_engine_hides(ropes: dict[str, list[Episode]]) -> None:
     assert "z axis" in result.cause("grip_slip").why
     assert result.cause("table_height").parameters["height"][0] == pytest.approx(0.012, abs=5e-4)
     assert result.calibration.identity  # both are physics
+
+
+def test_a_table_that_is_not_flat_is_seen(ropes: dict[str, list[Episode]]) -> None:
+    relief = measure(ropes["ridges"], ropes["plain"], bare_twin()).cause("table_relief")
+    assert relief.accepted and relief.parameters["relief"][0] > 5e-4
+    flat = measure(ropes["both"], ropes["plain"], bare_twin()).cause("table_relief")
+    assert flat.testable and not flat.accepted
+    alone = measure(ropes["ridges"], None, bare_twin()).cause("table_relief")
+    assert not alone.testable and "reference" in alone.why
 
 
 @pytest.mark.parametrize("cable", ["deform_dlo1", "deform_dlo2"])

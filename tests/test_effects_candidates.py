@@ -80,6 +80,23 @@ def test_wind_pushes_a_line_across_itself() -> None:
                 assert np.allclose(after.velocity.numpy(), change, atol=1e-6), (share, stiffness, worlds)
 
 
+@pytest.mark.parametrize("power", [1.0, 1.5, 2.0, 3.0])
+def test_drag_of_any_power_slows_by_its_law(power: float) -> None:
+    # v' = -b v^p from 2 m/s for 1 s: v^(1-p) grows by (p - 1) b t; for p = 1 v falls by exp(-b t).
+    slow = one("drag_power", coefficient=0.7, power=power)
+    _, after = flown(slow, [[0.0] * 3, [5.0, 0.0, 0.0]], [[2.0, 0.0, 0.0]] * 2, 100)
+    left = 2.0 * math.exp(-0.7) if power == 1.0 else (2.0 ** (1 - power) + (power - 1) * 0.7) ** (1 / (1 - power))
+    assert float(after.velocity[0, 0]) == pytest.approx(left, rel=1e-3)
+
+
+def test_friction_of_the_square_slows_by_its_law() -> None:
+    # v' = -c g v^2 from 1 m/s: after 1.2 s log(1 + 1.2 c g) / (c g).
+    c = 0.3
+    assert stops(one("friction_power", coefficient=c, power=2.0), [0.0, 90.0], 0.0) == pytest.approx(
+        [math.log(1.0 + 1.2 * c * G) / (c * G)] * 2, rel=2e-3
+    )
+
+
 def test_attraction_is_strongest_at_its_range() -> None:
     # In one step of 0.01 s: a at d = r, and 2 exp(1/2 - 2) a = 0.44626 a at d = 2 r.
     push = one("attraction", strength=2.0, center=(0.1, 0.2, 0.3), range=0.2)

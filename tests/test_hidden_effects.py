@@ -45,8 +45,12 @@ def test_nothing_is_named_where_nothing_is_hidden(case: Case, hidden_answers: An
     assert answer["outcome"] == "none" and not answer["causes"], said(answer)
 
 
-def test_what_no_candidate_explains_is_called_unknown(hidden_answers: Answers) -> None:
-    assert hidden_answers[UNKNOWN]["outcome"] == "unknown", said(hidden_answers[UNKNOWN])
+@pytest.mark.parametrize("case", UNKNOWN, ids=lambda c: c.name)
+def test_what_no_law_of_the_library_explains_is_called_unknown(case: Case, hidden_answers: Answers) -> None:
+    answer = hidden_answers[case]
+    assert answer["outcome"] == "unknown", said(answer)
+    assert tuple(c["id"] for c in answer["causes"]) == case.right, said(answer)
+    assert all(c["contradicted"] for c in answer["causes"]), said(answer)
 
 
 def test_two_hidden_effects_are_both_named(hidden_answers: Answers) -> None:

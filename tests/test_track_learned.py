@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,9 @@ import torch
 
 from pred_core.errors import ConfigError
 from pred_core.track.learned_masks import MaskFollower, NamedObject, TextDetector, load_named_object
-from pred_core.track.learned_points import CoTracker3, TapNext
+from pred_core.track.learned_points import CoTracker3, TapNext, load_points
 from pred_core.track.line_config import LineConfig
+from pred_core.track.settings import TrackerSettings, make_tracker
 from pred_core.track.tracker import Tracker, TrackerConfig
 from pred_core.track.workspace import Workspace
 
@@ -55,17 +57,18 @@ def test_cotracker_answers_every_half_window_with_the_newest_picture() -> None:
     with pytest.raises(ConfigError, match="Call start first"):
         follower.follow(RGB)
     follower.start(RGB, np.array([[3.0, 5.0]]))
-    assert follower.follow(RGB)[0].tolist() == [[3.0, 5.0]]
-    assert follower.follow(RGB)[0].tolist() == [[3.0, 5.0]]
+    for _ in range(2):
+        place, visible = follower.follow(RGB)
+        assert place.tolist() == [[3.0, 5.0]] and visible.tolist() == [False]  # no answer for this picture
     place, visible = follower.follow(RGB)  # the fourth picture: a whole window of four
     assert place.tolist() == [[6.0, 8.0]] and visible.tolist() == [True]
 
 
 class FakeTapNext:
-    """The interface of TAPNext: y before x, a state handed on; every point moves right by two pixels."""
+    """The interface of TAPNext: squares of 256, y before x, a state handed on; points move right by two pixels."""
 
     def __call__(self, video: torch.Tensor, query_points: Any = None, state: Any = None) -> Any:
-        assert video.shape == (1, 1, 32, 48, 3) and abs(float(video.mean()) - (100 / 127.5 - 1)) < 1e-6
+        assert video.shape == (1, 1, 256, 256, 3) and abs(float(video.mean()) - (100 / 127.5 - 1)) < 1e-6
         yx = query_points[..., 1:] if state is None else state + torch.tensor([0.0, 2.0])
         return yx[:, None], None, torch.ones(1, 1, yx.shape[1], 1), yx
 
@@ -73,8 +76,29 @@ class FakeTapNext:
 def test_tapnext_swaps_its_axes_and_keeps_its_state() -> None:
     follower = TapNext(model=FakeTapNext())
     follower.start(RGB, np.array([[10.0, 4.0]]))
-    assert follower.follow(RGB)[0].tolist() == [[12.0, 4.0]]
-    assert follower.follow(RGB)[0].tolist() == [[14.0, 4.0]]
+    step = 2.0 * 48 / 256  # of a square's pixel, in a picture of 48 columns
+    for k in (1, 2):
+        place, visible = follower.follow(RGB)
+        assert place == pytest.approx(np.array([[10.0 + k * step, 4.0]]), abs=1e-4) and visible.tolist() == [True]
+    with pytest.raises(ConfigError, match="Call start first"):
+        follower.another().follow(RGB)
+
+
+def test_points_are_asked_for_by_name_and_folder(tmp_path: Path) -> None:
+    """What `pred track` and the node `tracker` say to `points` and `points_folder`."""
+    sheet = TrackerSettings(kind="sheet", points="cotracker3", points_folder=str(tmp_path))
+    with pytest.raises(ConfigError, match="CoTracker3: no weights on disk.*scaled_online.pth"):
+        make_tracker(sheet)
+    with pytest.raises(ConfigError, match="TAPNext: no weights on disk"):
+        make_tracker(dataclasses.replace(sheet, points="tapnext"))
+    with pytest.raises(ConfigError, match="'tapnext' for a line.*kind: sheet or volume"):
+        make_tracker(TrackerSettings(points="tapnext", points_folder=str(tmp_path)))
+    with pytest.raises(ConfigError, match="'points_folder' without 'points'"):
+        make_tracker(dataclasses.replace(sheet, points=""))
+    for name in ("a.npz", "b.pt"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(ConfigError, match=r"several checkpoints; got a.npz, b.pt"):
+        load_points("tapnext", tmp_path)
 
 
 @pytest.mark.skipif(bool(MISSING), reason=f"{' and '.join(MISSING)} not installed (optional, in none of the extras)")

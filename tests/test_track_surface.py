@@ -15,7 +15,8 @@ import mujoco
 from pred_core.plant.appearance import cover, dress_spec, speckled_picture
 from pred_core.plant.cameras import Cameras, ring_of_cameras
 from pred_core.plant.rope import GROUND
-from pred_core.track.flow import depth_at, follow_pixels
+from pred_core.track import surface_tracker
+from pred_core.track.flow import depth_at, follow_pixels, gray_of
 from pred_core.track.paper_rollout import PaperRollout
 from pred_core.track.rigidity import RigidityGraph
 from pred_core.track.surface_tracker import SurfaceConfig, spread
@@ -165,6 +166,63 @@ def test_board_is_followed_and_the_rollout_drifts(board: Board) -> None:
     # A pixel is 2.7 mm: patches and depth are known to a fraction of it. What adds up flow alone walks away from there.
     assert max(error) < 0.5 * 0.0027
     assert 2.0 * error[-1] < drift[-1]
+
+
+class Points:
+    """A model's stand-in: Lucas-Kanade from picture to picture, which answers every second time."""
+
+    started: list[int] = []  # how many points each time, of all cameras
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def another(self) -> Points:
+        return Points()
+
+    def start(self, rgb: np.ndarray, pixel: Array) -> None:
+        self.before, self.pixel = gray_of(rgb), pixel.copy()
+        self.started.append(len(pixel))
+
+    def follow(self, rgb: np.ndarray) -> tuple[Array, np.ndarray]:
+        gray = gray_of(rgb)
+        self.pixel, good = follow_pixels(self.before, gray, self.pixel, self.pixel, largest=5.0)
+        self.before, self.count = gray, self.count + 1
+        return self.pixel, good & (self.count % 2 == 0)
+
+
+def test_a_models_points_are_used_where_there_are_some(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without any flow of its own the tracker follows what the model follows; without the model too it is blind."""
+    monkeypatch.setattr(surface_tracker, "follow_pixels", lambda *a: (a[3], np.zeros(len(a[3]), bool)))
+    monkeypatch.setattr(Points, "started", [])
+    seen: dict[str, list[int]] = {"model": [], "nothing": []}
+    for name, follower in (("model", Points()), ("nothing", None)):
+        tracker, first = Tracker(CONFIG, ["cam0", "cam1"], follower=follower), np.zeros(0)
+        for k in range(9):
+            shift = np.array([0.004, 0.002, 0.0]) * k
+            for camera, frame in board.frames(START + k * STEP, shift, 0.0).items():
+                tracker.add_frame(camera, frame)
+            estimate = tracker.step()
+            assert estimate is not None
+            first = estimate.tracks.position if k == 0 else first
+            if estimate.tracks.visible.mean() > 0.5 and k:
+                seen[name].append(k)
+                assert np.linalg.norm(estimate.tracks.position - first - shift, axis=-1).mean() < 0.5 * 0.0027
+    assert seen == {"model": [1, 3, 5, 7], "nothing": []}  # the picture that it begins with is asked for too
+    assert len(Points.started) == 2 and min(Points.started) > 60  # once a camera, most of what it sees
+
+
+def test_a_model_begins_anew_where_it_follows_too_little(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One camera does not know the depth of half of the board at first."""
+    monkeypatch.setattr(Points, "started", [])
+    tracker = Tracker(CONFIG, ["cam0", "cam1"], follower=Points())
+    for k in range(4):
+        for camera, frame in board.frames(START + k * STEP, np.zeros(3), 0.0).items():
+            if camera == "cam1" and k < 2:
+                frame.depth[:, : frame.depth.shape[1] // 2] = np.nan
+            tracker.add_frame(camera, frame)
+        assert tracker.step() is not None
+    whole, half, anew = Points.started
+    assert half < 0.6 * whole and anew > 0.8 * whole
 
 
 def test_covered_sheet_is_unseen_then_lost(board: Board) -> None:

@@ -110,7 +110,7 @@ def add_evidence(page: Page, d: Diagnosis) -> None:
             continue
         ids = {j.trial.id: words(j.trial.id) for j, _, _ in seen.judged}
         after = "" if n == 0 else " (after what was named before)"
-        green = "nothing is named" if named is None else f"green: named, {words(named.trial.id)}"
+        green = "nothing is named" if named is None else f"green: {_verdict(named, d)}, {words(named.trial.id)}"
         page.figure(pictures.evidence(seen, ids, named, d.seed), f"Round {n + 1}{after}; {green}.")
         _round_table(page, d, n, named)
         _only_screened(page, seen)
@@ -124,7 +124,7 @@ def _round_table(page: Page, d: Diagnosis, n: int, named: Judged | None) -> None
     ids = [j.trial.id for j, _, _ in seen.judged]
     rows, marks = [], []
     for j, q, why in sorted(seen.judged, key=lambda row: (row[0] is not named, -row[0].mean)):
-        verdict = "named" if j is named else _in_words(why, ids) or _beaten(j, named, d)
+        verdict = _verdict(j, d) if j is named else _in_words(why, ids) or _beaten(j, named, d)
         share, likely = f"{100 * j.mean / excess:.0f} %", probability.get(j.trial.id, "–")
         rows.append((words(j.trial.id), j.trial.family, likely, share, f"{q:.2g}", _values(j.values), verdict))
         marks.append("strong" if j is named else "")
@@ -133,6 +133,11 @@ def _round_table(page: Page, d: Diagnosis, n: int, named: Judged | None) -> None
             rows.append((label, "", probability[id], "–", "–", "", ""))
             marks.append("")
     page.table(("candidate", "family", "probability", "saves", "p adjusted", "fitted", "verdict"), rows, marks)
+
+
+def _verdict(named: Judged, d: Diagnosis) -> str:
+    """What a candidate that was taken is: a name, or only the nearest law."""
+    return "nearest" if any(c.contradicted for c in d.causes if c.id in named.trial.ids) else "named"
 
 
 def _beaten(j: Judged, named: Judged | None, d: Diagnosis) -> str:

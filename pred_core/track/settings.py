@@ -14,6 +14,7 @@ import numpy as np
 from pred_core.config import load_yaml, setting
 from pred_core.errors import ConfigError, nearest
 from pred_core.track.line_config import LineConfig
+from pred_core.track.point_follower import PointFollower
 from pred_core.track.surface_tracker import SurfaceConfig
 from pred_core.track.tracker import MOST_CAMERAS, Masks, Tracker, TrackerConfig
 from pred_core.track.workspace import Workspace
@@ -47,12 +48,17 @@ class TrackerSettings:
     masks: str = setting("", doc="folder with SAM 2, which follows the object's masks; empty: masks without weights")
     detector: str = setting("", doc="folder with Grounding DINO, which finds the object for `masks`")
     object: str = setting("", doc="what `detector` looks for, e.g. white rope")
+    points: str = setting(
+        "", choices=("", "cotracker3", "tapnext"), doc="model that follows the points of a sheet or volume; empty: flow"
+    )
+    points_folder: str = setting("", doc="folder with that model's weights")
     patience: float = setting(0.03, unit="s", low=0.0, high=1.0, doc="wait for the other cameras after the first")
 
 
 def make_tracker(settings: TrackerSettings) -> Tracker:
     """The tracker the settings describe. Raises: ConfigError."""
-    tracker = Tracker(tracker_config(settings), parse_cameras(settings.cameras), _learned_masks(settings))
+    cameras = parse_cameras(settings.cameras)
+    tracker = Tracker(tracker_config(settings), cameras, _learned_masks(settings), _learned_points(settings))
     tracker.fixtures = parse_fixtures(settings.fixtures)
     return tracker
 
@@ -130,3 +136,19 @@ def _learned_masks(settings: TrackerSettings) -> Masks | None:
     from pred_core.track.learned_masks import load_named_object  # torch: seconds, which nobody else here needs
 
     return load_named_object(settings.object, Path(settings.detector), Path(settings.masks))
+
+
+def _learned_points(settings: TrackerSettings) -> PointFollower | None:
+    """The learned point tracks that are asked for. Raises: ConfigError without weights or packages, or for a line."""
+    if not settings.points:
+        if settings.points_folder:
+            raise ConfigError("parameter 'points_folder' without 'points'", allowed="points: cotracker3 or tapnext")
+        return None
+    if settings.kind == "line":
+        raise ConfigError(
+            "parameter 'points'", got=f"'{settings.points}' for a line", allowed="kind: sheet or volume",
+            next_step="Leave it out: a line is followed by its centreline",
+        )  # fmt: skip
+    from pred_core.track.learned_points import load_points  # torch: seconds, which nobody else here needs
+
+    return load_points(settings.points, Path(settings.points_folder))

@@ -6,7 +6,7 @@ A particle's pixel is lifted with the depth measured there, never a velocity int
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from pred_core.config import setting
 from pred_core.track.estimate import Estimate, Prior, Status, trace_confidence
 from pred_core.track.flow import Gray, depth_at, follow_pixels, gray_of
 from pred_core.track.grasp import Grasp, GraspConfig
+from pred_core.track.point_follower import PointFollower
 from pred_core.track.rigidity import RigidityGraph
 from pred_core.track.template import Templates
 from pred_core.track.view import View, pixel_rays, project
@@ -26,6 +27,8 @@ from pred_core.types import Array, CameraFrame, Tracks
 Poses = tuple[Array, Array]
 CELL = 0.01  # [m]
 ANCHORED, FLOWED, HELD = 4.0, 1.0, 50.0  # weights of one measurement
+NOBODY = np.zeros(0, dtype=np.int64)
+FOLLOWED = 0.7  # share of what a camera sees that a learned model must follow there, else it begins anew
 
 
 @dataclass(frozen=True)
@@ -49,13 +52,16 @@ class _Eye:
     gray: Gray
     frame: CameraFrame
     templates: Templates
+    follower: PointFollower | None = None
+    followed: NDArray[np.int64] = field(default_factory=lambda: NOBODY)  # particles, in the follower's order
 
 
 class SurfaceTracker:
     """Holds the particles; ids count from 0 and stay. One that is lost and found again goes on with new ids."""
 
-    def __init__(self, config: SurfaceConfig):
-        self.config = config
+    def __init__(self, config: SurfaceConfig, follower: PointFollower | None = None):
+        """`follower`: a learned model, asked for pixels before optical flow is."""
+        self.config, self._follower = config, follower
         self.grasp = Grasp(config.grasp)
         self.stamp = 0
         self.position: Array | None = None  # (P, 3) [m] world
@@ -138,10 +144,11 @@ class SurfaceTracker:
         guess, guessed_depth = project(expected + after, frame.intrinsics, frame.world_from_camera)
         usable = eye.templates.seen & _in_view(old, old_depth, eye.frame, self.config.occluder)
         usable &= np.isfinite(guess).all(axis=-1)
-        index = np.flatnonzero(usable)
         gray = gray_of(frame.rgb)
-        found, good = follow_pixels(eye.gray, gray, old[index], guess[index])
-        index, found = index[good], found[good]
+        index, found = _followed(eye, frame, usable)
+        rest = np.setdiff1d(np.flatnonzero(usable), index)
+        flowed, good = follow_pixels(eye.gray, gray, old[rest], guess[rest])
+        index, found = np.concatenate([index, rest[good]]), np.concatenate([found, flowed[good]])
         if not len(index):
             return points, strength
         tangents = self._projected_tangents(expected, turn, frame)
@@ -163,6 +170,8 @@ class SurfaceTracker:
             eye = self._eyes.get(camera)
             templates = eye.templates if eye else Templates.empty(len(position))
             gray = gray_of(frame.rgb)
+            same = eye is not None and np.array_equal(eye.frame.world_from_camera, frame.world_from_camera)
+            follower, followed = (eye.follower, eye.followed) if eye is not None and same else (None, NOBODY)
             fresh = visible & ~templates.seen
             if fresh.any():
                 turn = self.graph.rotations(position)
@@ -172,7 +181,21 @@ class SurfaceTracker:
                 seen = depth_at(frame.depth, np.where(np.isfinite(pixel), pixel, -1.0))
                 offset = _turned(np.swapaxes(turn, 1, 2), ray * (seen - depth)[:, None])
                 templates.keep(gray, new, pixel, self._projected_tangents(position, turn, frame), offset)
-            self._eyes[camera] = _Eye(gray, frame, templates)
+            self._eyes[camera] = _Eye(gray, frame, templates, follower, followed)
+            if self._follower is not None:
+                self._follow(self._eyes[camera], position, visible)
+
+    def _follow(self, eye: _Eye, position: Array, visible: NDArray[np.bool_]) -> None:
+        """See to it that a learned model follows what the camera sees: it begins anew where that is too little."""
+        assert self._follower is not None
+        offset = _turned(self.graph.rotations(position), eye.templates.offset)
+        pixel, depth = project(position + offset, eye.frame.intrinsics, eye.frame.world_from_camera)
+        seen = visible & eye.templates.seen & _in_view(pixel, depth, eye.frame, self.config.occluder)
+        mine = np.flatnonzero(seen)
+        if len(mine) and np.isin(mine, eye.followed).mean() < FOLLOWED:
+            eye.follower = eye.follower or self._follower.another()
+            eye.follower.start(eye.frame.rgb, pixel[mine])
+            eye.followed = mine
 
     def _projected_tangents(self, position: Array, turn: Array, frame: CameraFrame) -> Array:
         """Two tangents (P, 2, 2) of the surface in the picture, as columns [px]."""
@@ -204,6 +227,15 @@ class SurfaceTracker:
         error = np.linalg.norm(target - self.position, axis=-1)[visible]
         residual = float(np.sqrt((error**2).mean())) if len(error) else float("nan")
         return Estimate(tracks, covariance, self.velocity.copy(), status, residual, cameras)
+
+
+def _followed(eye: _Eye, frame: CameraFrame, usable: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Array]:
+    """(particles (M,), their pixels (M, 2)) that a learned model sees in this picture; none without one."""
+    if eye.follower is None:
+        return NOBODY, np.zeros((0, 2))
+    pixel, seen = eye.follower.follow(frame.rgb)
+    seen = seen & usable[eye.followed] & np.isfinite(pixel).all(axis=-1)
+    return eye.followed[seen], pixel[seen]
 
 
 def _turned(turn: Array, vectors: Array) -> Array:

@@ -17,6 +17,7 @@ from pred_core.track.line_config import LineConfig
 from pred_core.track.line_tracker import LineTracker
 from pred_core.track.mask import ObjectMask
 from pred_core.track.picture_clock import PictureClock
+from pred_core.track.point_follower import PointFollower
 from pred_core.track.surface_tracker import SurfaceConfig, SurfaceTracker
 from pred_core.track.view import View, check_frame
 from pred_core.track.workspace import Shape, Workspace, check_workspace
@@ -55,8 +56,15 @@ class Masks(Protocol):
 class Tracker:
     """Online and causal. Feed `add_frame` in any order; `step` takes what is new."""
 
-    def __init__(self, config: TrackerConfig, cameras: Sequence[str], masks: Masks | None = None):
+    def __init__(
+        self,
+        config: TrackerConfig,
+        cameras: Sequence[str],
+        masks: Masks | None = None,
+        follower: PointFollower | None = None,
+    ):
         """`masks`: a learned model's, beside workspace, table and colour; sheets and volumes are only found with them.
+        `follower`: a learned model's point tracks, for sheets and volumes.
 
         Raises: ConfigError for no camera, more than eight, or an empty workspace.
         """
@@ -68,12 +76,12 @@ class Tracker:
                 next_step="Name them, e.g. cameras:=cam0,cam1",
             )
         check_workspace(config.workspace)
-        self.config, self.cameras, self._masks = config, tuple(cameras), masks
+        self.config, self.cameras, self._masks, self._follower = config, tuple(cameras), masks, follower
         self.mask = ObjectMask(config.workspace)
         self.fixtures: tuple[Shape, ...] = ()
         self.robot: tuple[Shape, ...] = ()
         self.stale = 0  # pictures that came too late to be used
-        self._line, self._surface = LineTracker(config.line), SurfaceTracker(config.surface)
+        self._line, self._surface = LineTracker(config.line), SurfaceTracker(config.surface, follower)
         self._path = GripperPath()
         self._clock = PictureClock()
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
@@ -153,7 +161,8 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget the object; it is searched in the next pictures."""
-        self._line, self._surface = LineTracker(self.config.line), SurfaceTracker(self.config.surface)
+        self._line = LineTracker(self.config.line)
+        self._surface = SurfaceTracker(self.config.surface, self._follower)
         self.mask.color = None
         self._frames, self._views, self._searching = {}, {}, True
         if self._masks is not None:
