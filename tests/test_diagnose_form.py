@@ -112,7 +112,7 @@ def test_a_plane_is_not_the_law_of_an_uneven_table() -> None:
     assert not progress.named[0].contradicted and not progress.unknown  # drag says nothing of a table
 
     flat = dataclasses.replace(progress.named[0], judged=dataclasses.replace(
-        progress.named[0].judged, trial=dataclasses.replace(progress.named[0].judged.trial, ids=("table_height",))
+        progress.named[0].judged, trial=dataclasses.replace(progress.named[0].judged.trial, family="table")
     ))  # fmt: skip
     progress.named = [flat]
     check_table(progress, gate(dataclasses.replace(relief, accepted=False)))

@@ -55,7 +55,7 @@ def check_table(progress: Progress, gate: GateResult) -> None:
     if not relief.accepted:
         return
     said = f"what rests on it does not lie on a plane: {relief.why}"
-    flat = [n for n in progress.named if find_effect(n.judged.trial.ids[0]).family == "table"]
+    flat = [n for n in progress.named if "table" in n.judged.trial.family.split("+")]
     progress.named = [dataclasses.replace(n, contradicted=said) if n in flat else n for n in progress.named]
     progress.unknown |= not progress.named
 
@@ -118,7 +118,7 @@ def _refit(progress: Progress, bench: Bench, key: str) -> _Refit:
         left_out = without_groups(found, trial.space, groups[bench.train])
         losses = target.losses(trial.space, [found.z, *left_out.values()])
         crossed = losses[0].copy()
-        for row, group in enumerate(left_out):
+        for row, group in enumerate(left_out if bench.config.cross_fit else ()):
             crossed[groups == group] = losses[1 + row][groups == group]
         rows = [p.tolist() for p in left_out.values()] or [found.z.tolist()]
         return {"z": found.z.tolist(), "left_out": rows, "losses": crossed.tolist()}

@@ -16,7 +16,7 @@ from pred_core.diagnose.pairs import try_pairs
 from pred_core.diagnose.places import Start
 from pred_core.diagnose.progress import Progress, Round
 from pred_core.diagnose.roll import on_ground
-from pred_core.diagnose.skill import POOR, skill_of
+from pred_core.diagnose.skill import POOR, WELL, skill_of
 from pred_core.diagnose.trial import NOT_A_NAME, make_trial
 from pred_core.effects import LIBRARY
 from pred_core.types import Array
@@ -116,7 +116,8 @@ def finish(progress: Progress) -> None:
     progress.explained = None if found is None else found.share
     poor = found is not None and found.share < POOR
     if bench.reference is None:
-        loud = not progress.named and float(bench.standing().mean()) > _counts(bench, UNEXPLAINED)
+        well = found is not None and found.share >= WELL
+        loud = not progress.named and not well and float(bench.standing().mean()) > _counts(bench, UNEXPLAINED)
         progress.unknown = loud or poor
         return
     suspect, reference = bench.standing(), _reference_losses(bench)

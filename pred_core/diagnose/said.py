@@ -68,7 +68,9 @@ def sentence(d: Diagnosis) -> str:
         numbers = f"the {held} is {e.base.mean:.1f} mm"
     label = "Exploratory, too few episodes or recordings for a firm answer: " if d.exploratory else ""
     if d.outcome == "none":
-        return f"{label}Nothing is found that your simulation lacks: its {held} is {e.base.mean:.1f} mm."
+        known = e.floor is not None or d.explained is None
+        share = "" if known else f"; it explains {max(d.explained or 0.0, 0.0):.0%} of the motion"
+        return f"{label}Nothing is found that your simulation lacks: its {held} is {e.base.mean:.1f} mm{share}."
     if d.outcome == "unknown" and _no_base(d):
         share = f"{max(d.explained or 0.0, 0.0):.0%} of the motion"
         return f"{label}Your twin explains {share}, too little to tell what it lacks: identify it anew; {numbers}."

@@ -147,7 +147,10 @@ def _load_tapnext(checkpoint: Path | None) -> Any:
         module = importlib.import_module("tapnet.tapnext.tapnext_torch")
         utilities = importlib.import_module("tapnet.tapnext.tapnext_torch_utils")
     except ImportError as error:
-        raise ConfigError("TAPNext needs the tapnet package", next_step="pip install git+https://github.com/google-deepmind/tapnet") from error
+        raise ConfigError(
+            "TAPNext needs the tapnet package", got=error,
+            next_step="pip install git+https://github.com/google-deepmind/tapnet",
+        ) from error  # fmt: skip
     model = module.TAPNext(image_size=(SIZE, SIZE))
     if path.suffix == ".npz":  # as its authors publish it
         model = utilities.restore_model_from_jax_checkpoint(model, str(path))
