@@ -157,8 +157,9 @@ class Shell(LifecycleNode):
             self.fail(error)
 
     def fail(self, error: PredError) -> None:
-        """End the process with one clear line."""
-        self.report(ERROR, str(error))
+        """End the process with one clear line, which the diagnostics have too; the logger would print it again."""
+        if self.diagnostics.status(ERROR, str(error)):
+            self.publish_diagnostics()
         print(f"{self.NAME}: {error}", file=sys.stderr, flush=True)
         self.exit_code = BAD_INPUT
 

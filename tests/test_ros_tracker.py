@@ -214,9 +214,18 @@ def test_depth_of_another_frame_is_refused(rig: Rig) -> None:
     assert rig.bench.says(ERROR, "cam0", "not registered", "cam0_depth_optical_frame")
 
 
-def test_zero_cameras_end_the_node_with_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        (["cameras:=''"], "parameter 'cameras'; got ''; allowed: 1 to 8"),
+        (["kind:=sheet", "points:=tapnext", "points_folder:=nowhere"], "TAPNext: no weights on disk; got nowhere"),
+    ],
+)
+def test_what_cannot_be_ends_the_node_with_one_line(
+    parameters: list[str], said: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     with own_domain():
-        rclpy.init(args=["--ros-args", "-p", "cameras:=''"])
+        rclpy.init(args=["--ros-args", *(word for p in parameters for word in ("-p", p))])
         node = TrackerNode()
         try:
             node.trigger_configure()
@@ -224,7 +233,7 @@ def test_zero_cameras_end_the_node_with_one_line(capfd: pytest.CaptureFixture[st
         finally:
             node.destroy_node()
             rclpy.try_shutdown()
-    assert "parameter 'cameras'; got ''; allowed: 1 to 8" in capfd.readouterr().err
+    assert capfd.readouterr().err.count(said) == 1
 
 
 def test_lists_in_parameters() -> None:
