@@ -23,7 +23,7 @@ LEAST = 0.5  # of the reference that a base must explain
 POOR = 2.0 / 3.0  # below it nobody can say that nothing is lacking
 # From it on, without a reference, what is left may be what engine and object have apart: ropes with nothing hidden are
 # explained to 0.94 (5th percentile of 40 seen controls), with a swirl, gusts or a shaking table to 0.77 to 0.94.
-WELL = 0.9
+WELL = 0.94
 
 
 @dataclass(frozen=True)
