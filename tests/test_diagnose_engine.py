@@ -18,8 +18,9 @@ from pred_core.diagnose.commission import commission, values_of
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.journal import Journal
-from pred_core.diagnose.judge import judge, screen
+from pred_core.diagnose.judge import Screened, judge, screen
 from pred_core.diagnose.naming import exploratory, one_recording, why_not
+from pred_core.diagnose.places import Start
 from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.rounds import finish
@@ -273,6 +274,24 @@ def test_a_base_that_predicts_nothing_is_never_good_enough(
     alone, beside = (with_errors(said, [50.0], [50.0], floor) for floor in (None, 5.0))
     assert "20% of the motion, too little" in sentence(dataclasses.replace(said, errors=alone))
     assert "no candidate explains" in sentence(dataclasses.replace(said, errors=beside))
+
+
+def test_a_cause_acts_where_it_moves_something_itself(twin: Twin, dragged: list[Episode]) -> None:
+    """Without a reference the base is refitted beside every candidate, which moves episodes that the candidate does not
+    touch: a table 5 cm below the hanging rope's end has no vote in any, drag has one in all.
+    """
+    journal = Journal(None, {})
+    journal.known["base"] = values_of(twin.replace(physics=dataclasses.replace(twin.physics, stiffness=6.0)))
+    bench = commission(twin, dragged, [], SMALL, quiet, journal)
+    for id, at, where in (("table_height", 0.05, 0), ("drag_linear", 0.5, len(dragged))):
+        trial = bench.trial((find_effect(id),))
+        z = trial.space.start()
+        (own,) = (n for n, k in enumerate(trial.space.knobs) if k.name.startswith(id))
+        z[own] = trial.space.knobs[own].coordinate(at)
+        screened = Screened((find_effect(id),), trial, [Start(z, 1.0)], 1.0, trial.space.start())
+        found = judge(bench, screened, Journal(None, {}), id)
+        assert found.values["stiffness"] > 7.0, "nothing is refitted here"
+        assert int(found.acts.sum()) == where
 
 
 def test_without_a_reference_a_small_misfit_is_not_called_unknown(

@@ -35,7 +35,7 @@ class Judged:
     # Parameters for an episode whose recording is fitted are one step from the joint fit, taken without that recording
     # (`fit.without_groups`); for any other they are the joint fit's.
     gain: Array  # (E,) loss saved on each episode
-    acts: NDArray[np.bool_]  # (E,) it moves the episode at all
+    acts: NDArray[np.bool_]  # (E,) it moves the episode by itself, whatever is refitted beside it
     extended: Array  # (E,) loss with it
     z: Array  # coordinates of `values`
 

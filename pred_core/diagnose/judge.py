@@ -202,13 +202,15 @@ def _judge(bench: Bench, screened: Screened) -> dict[str, object]:
     null = null_of(bench, screened, result.z)
     sample = target.roller.sample
     left_out = without_groups(result, space, sample.groups[train])
-    u = target.residuals(space, [null, result.z, *left_out.values()])
+    own = [any(k.name.startswith(f"{id}.") for id in trial.ids) for k in space.knobs]
+    without = np.where(own, null, result.z)  # what is refitted beside it moves episodes in which it does nothing
+    u = target.residuals(space, [null, result.z, without, *left_out.values()])
     losses = target.losses_of(u)
     extended = losses[1].copy()
     for row, group in enumerate(left_out if bench.config.cross_fit else ()):
         mine = sample.groups == group  # also test episodes of that recording
-        extended[mine] = losses[2 + row][mine]
-    moved = np.sqrt(np.maximum(target.per_episode((u[1] - u[0]).square()[None])[0], 0.0))
+        extended[mine] = losses[3 + row][mine]
+    moved = np.sqrt(np.maximum(target.per_episode((u[1] - u[2]).square()[None])[0], 0.0))
     return {
         "z": result.z.tolist(),
         "null": null.tolist(),
