@@ -18,6 +18,7 @@ STILL_LEAST = 1.5e-3  # [m]
 TOGETHER = 3  # particles that rest at once: a hanging end that lags is alone
 FLAT = 5e-4  # [m] spread of the heights of what rests on a plane, or the noise if that is larger; more is no plane
 FEWEST = 3  # episodes
+OFF = 0.02  # [m] from the plane, beyond which what is still does not rest on it: it hangs
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Plane:
     episodes: int
     extent: Array  # (2,) [m] standard deviation of the resting points' x, y
     spread: float  # [m] of the resting points beside it: the median deviation as a normal standard deviation
-    spreads: Array  # (episodes,) [m] the same of each episode by itself
+    spreads: Array  # (<= episodes,) [m] the same of each episode by itself, of what is within OFF of it
 
 
 def resting_points(episode: Episode, sigma: float) -> Array:
@@ -67,12 +68,13 @@ def fit_plane(episodes: Sequence[Episode], sigma: float, middle: Array | None = 
     parts = [_plane(np.concatenate(points[:k] + points[k + 1 :]), where)[0] for k in range(len(points))]
     off = np.array(parts) - np.mean(parts, axis=0)
     covariance = (len(points) - 1) / len(points) * off.T @ off + 1e-10 * np.diag([1.0, 1.0, 1.0])
-    spreads = np.array([_spread(r) for r in pieces])
+    near = [r[np.abs(r) < OFF] for r in pieces]
+    spreads = np.array([_spread(r) for r in near if len(r) >= TOGETHER])
     return Plane(where, value, covariance, len(points), everything[:, :2].std(axis=0), _spread(residual), spreads)
 
 
 def _spread(residual: Array) -> float:
-    return max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
+    return 1.4826 * float(np.median(np.abs(residual)))
 
 
 def compare(value: Array, covariance: Array, part: slice, freedom: int) -> tuple[float, Array]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import ttest_ind
+from scipy.stats import mannwhitneyu
 
 from pred_core.diagnose.gate_result import GateCause
 from pred_core.diagnose.gate_select import LEVEL
-from pred_core.diagnose.gate_table import FLAT, Plane, compare, fit_plane
+from pred_core.diagnose.gate_table import FEWEST, FLAT, Plane, compare, fit_plane
 from pred_core.types import Episode
 
 PLANE_CAUSES = ("table_height", "table_tilt")
@@ -48,10 +48,14 @@ def _not_testable(why: str, *ids: str) -> list[GateCause]:
 
 
 def _relief(plane: Plane, before: Plane | None, sigma: float, family: int) -> list[GateCause]:
-    """Whether particles rest farther off their plane than in the reference: Welch's test on logs of the episodes."""
+    """Whether particles rest farther off their plane than in the reference: a rank test over episodes (Mann and Whitney
+    1947), because one in which few particles rest may be far out.
+    """
     if before is None:
         return _not_testable("needs a reference: how far particles rest off a plane depends on the tracks", RELIEF)
-    p = float(ttest_ind(np.log(plane.spreads), np.log(before.spreads), equal_var=False, alternative="greater").pvalue)
+    if min(len(plane.spreads), len(before.spreads)) < FEWEST:
+        return _not_testable("too few particles rest on one plane while the gripper moves", RELIEF)
+    p = float(mannwhitneyu(plane.spreads, before.spreads, alternative="greater").pvalue)
     size = float(np.sqrt(max(plane.spread**2 - before.spread**2, 0.0)))
     smallest = max(SMALLEST_CHANGE, 0.5 * sigma)
     return [
