@@ -2,7 +2,7 @@
 
 A law that is only near explains most of the error too: drag with the power 3/2 of the speed is fitted by the square to
 a sixth of what it adds. A power fitted beside it tells the two apart, for it moves the shape of a motion and not its
-size: on development cases it is 1.50 and 1.53 for the power 3/2, and within 0.06 of the law's own where the law is
+size: on development cases it is 1.48 to 1.56 for the power 3/2, and within 0.05 of the law's own where the law is
 right.
 """
 
