@@ -12,7 +12,7 @@ import pytest
 from report_cases import LINEAR, answer, drag, judged, recorded, rope, with_errors
 
 from pred_core.calibration import Calibration
-from pred_core.diagnose.answer import CHEAP, Study, closed_by_gate, refining_of
+from pred_core.diagnose.answer import CHEAP, Study, closed_by_gate, outcome_of, refining_of
 from pred_core.diagnose.causes import causes_of
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.errors import episode_errors
@@ -54,8 +54,9 @@ def progress_of(groups: Sequence[int], *named: Named) -> Progress:
     """As far as causes are read from it; `groups`: recordings, of train episodes all."""
     sample = SimpleNamespace(groups=np.array(groups), episodes=len(groups))
     bench = SimpleNamespace(
-        target=SimpleNamespace(roller=SimpleNamespace(sample=sample)), train=np.ones(len(groups), bool), reference=None
-    )
+        target=SimpleNamespace(roller=SimpleNamespace(sample=sample)), train=np.ones(len(groups), bool), reference=None,
+        config=DiagnoseConfig(),
+    )  # fmt: skip
     return cast(Progress, SimpleNamespace(bench=bench, named=list(named), rounds=[], unknown=False))
 
 
@@ -184,3 +185,19 @@ def test_what_the_base_is_and_what_refining_changed(twin: Twin, dragged: list[Ep
     assert refining_of(study, errors, 2.0 * CHEAP) == text.split(":")[0] + ":" + text.split(":")[1]
     bench.reference = None
     assert "refined on the train episodes" in refining_of(study, errors, 2.0 * CHEAP)
+
+
+def test_a_law_that_the_data_contradict_is_no_name(twin: Twin, dragged: list[Episode]) -> None:
+    """The first cause decides: where its law is only the nearest one the answer is unknown; a later one is marked."""
+    d = answer(twin, dragged)
+    drag_cause = dataclasses.replace(d.causes[0], contradicted="its power is 1.50 [1.41, 1.58], not 2 (p 0.001)")
+    tip = Cause("tip_mass", "mass", 0.7, {}, False, 0.3, 0.04)
+    progress = progress_of((0, 1))
+    for causes, outcome in (((drag_cause, tip), "unknown"), ((tip, drag_cause), "named"), ((tip,), "named")):
+        assert outcome_of(causes, progress) == outcome
+        said = sentence(dataclasses.replace(d, causes=causes, outcome=outcome))
+        if outcome == "unknown":
+            assert "whose law no candidate has. The nearest is air drag: 1.5 1/s" in said
+            assert "but its power is 1.50 [1.41, 1.58], not 2" in said and "Besides it lacks mass at the tip." in said
+        else:
+            assert ("(nearly: its power is 1.50" in said) == (drag_cause in causes)

@@ -56,7 +56,7 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         study.gate, progress, {r.id: r.probability for r in ranked}, closed_by_gate(study.gate, budget["named"], errors)
     )
     ood = _errors(study, progress, "ood") if any(e.split == "ood" for e in study.corrected) else None
-    outcome = _outcome(causes, progress)
+    outcome = outcome_of(causes, progress)
     result = Diagnosis(
         outcome=outcome,
         sentence="",
@@ -84,7 +84,8 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
     return dataclasses.replace(result, sentence=sentence(result), seconds=time.monotonic() - begin)
 
 
-def _outcome(causes: Sequence[Cause], progress: Progress) -> str:
+def outcome_of(causes: Sequence[Cause], progress: Progress) -> str:
+    """One of OUTCOMES, from what was named and whether something is left."""
     physics = [c for c in causes if not c.measured]
     cold = progress.bench.reference is None  # nobody knows there how much there is to explain
     least = progress.bench.config.enough if cold else PARTLY

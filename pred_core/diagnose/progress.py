@@ -61,8 +61,11 @@ class Progress:
     def replace(self, named: Named, instead: Named, bench: Bench) -> None:
         """Put another law, fitted with all that was named, in the place of one that the data contradict."""
         seen = self.rounds[named.round]
-        judged = tuple((j, p, instead.contradicted if j is named.judged else why) for j, p, why in seen.judged)
-        judged = (*judged, (instead.judged, instead.p_adjusted, ""))
+        rows = [
+            (j, p, instead.contradicted if not why and j.trial.ids == named.judged.trial.ids else why)
+            for j, p, why in seen.judged
+        ]
+        judged = (*rows, (instead.judged, instead.p_adjusted, ""))
         self.rounds[named.round] = dataclasses.replace(seen, judged=judged)
         self.named = [instead if n is named else refitted(n, instead.judged) for n in self.named]
         self.bench = bench

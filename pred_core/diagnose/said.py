@@ -76,9 +76,11 @@ def sentence(d: Diagnosis) -> str:
         return f"{label}Your twin explains {share}, too little to tell what it lacks: identify it anew; {numbers}."
     near = next((c for c in d.causes if c.contradicted), None)
     if d.outcome == "unknown" and near is not None:
+        beside = "; and ".join(called(c) for c in d.causes if c is not near)
+        beside = f" Besides it lacks {beside}." if beside else ""
         return (
             f"{label}Your simulation lacks something whose law no candidate has. The nearest is {called(near)}, but "
-            f"{near.contradicted}; with it {numbers}."
+            f"{near.contradicted}; with it {numbers}.{beside}"
         )
     if d.outcome == "unknown":
         some = ", ".join(NAMES.get(c.id, c.id) for c in d.causes)
