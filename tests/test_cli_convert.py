@@ -26,6 +26,24 @@ def test_convert_then_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert [e["name"] for e in facts["episodes"]] == ["ep000", "ep001", "ep002", "ep003"]
 
 
+@pytest.mark.parametrize("form", ["deform", "beam"])
+def test_a_measured_file_is_found_by_its_name(
+    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PRED_DATA", str(_npz(tmp_path / "deform_x.npz").parent))
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    if form == "deform":
+        assert main(["convert", form, "deform_x.npz", "--out", "out"]) == 0
+        assert (tmp_path / "empty/out/dataset.yaml").exists()
+    else:  # found, and refused for what is in it
+        assert main(["convert", form, "deform_x.npz", "--out", "out"]) == 2
+        assert "no takes of a beam" in capsys.readouterr().err
+    assert main(["convert", form, "deform_y.npz", "--out", "no"]) == 2
+    said = capsys.readouterr().err
+    assert "no measured data 'deform_y.npz' found" in said and "Set PRED_DATA" in said
+
+
 def test_info_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(line_bag(tmp_path / "a.mcap")), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)

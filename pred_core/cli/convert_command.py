@@ -9,21 +9,24 @@ from pathlib import Path
 
 from pred_core.bag.beam import convert_beam, read_beam
 from pred_core.bag.deform import Progress, convert_deform, read_deform
+from pred_core.bag.measured import measured_or_explain
 from pred_core.bag.sample import write_sample
 
 NAME = "convert"
 HELP = "Convert measured data of other projects into a data set of bags."
+_PLACES = "if it is not there, it is looked for in PRED_DATA, data/ and ../shared/data"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Arguments of `pred convert`."""
     formats = parser.add_subparsers(dest="format", required=True, metavar="FORMAT")
     deform = formats.add_parser("deform", help="the measured cables of DEFORM (arXiv 2406.05931)")
-    deform.add_argument("source", type=Path, help="deform_dlo1.npz, or a folder with train/*.pkl and eval/*.pkl")
+    files = "deform_dlo1.npz, or a folder with train/*.pkl and eval/*.pkl"
+    deform.add_argument("source", type=Path, help=f"{files}; {_PLACES}")
     deform.add_argument("--out", type=Path, required=True, metavar="DATASET", help="folder to write")
     deform.set_defaults(convert=_deform)
     beam = formats.add_parser("beam", help="the released soft beam of srl-ethz/diffPD_sim2real")
-    beam.add_argument("source", type=Path, help="soft_beam.npz")
+    beam.add_argument("source", type=Path, help=f"soft_beam.npz; {_PLACES}")
     beam.add_argument("--load", type=int, default=0, metavar="GRAMS", help="takes with this load: 0 or 52")
     beam.add_argument("--out", type=Path, required=True, metavar="DATASET", help="folder to write")
     beam.set_defaults(convert=_beam)
@@ -38,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _deform(args: argparse.Namespace) -> int:
-    source = read_deform(args.source)
+    source = read_deform(_found(args.source))
     dataset = convert_deform(source, args.out, progress_line())
     counts = ", ".join(f"{len(dataset.select(s))} {s}" for s in dataset.splits)
     recordings = len(set(source.recording))
@@ -48,11 +51,16 @@ def _deform(args: argparse.Namespace) -> int:
 
 
 def _beam(args: argparse.Namespace) -> int:
-    source = read_beam(args.source, args.load)
+    source = read_beam(_found(args.source), args.load)
     dataset = convert_beam(source, args.out, progress_line())
     print(f"{dataset.root}: {len(dataset.entries)} episodes of {len(source.takes)} takes with {source.load} g")
     print("between clamp and tip nothing was measured: particles there are estimated, and never scored")
     return 0
+
+
+def _found(source: Path) -> Path:
+    """The path as given, else where measured data are. Raises: DatasetError, ConfigError (PRED_DATA is no folder)."""
+    return source if source.exists() or source.is_absolute() else measured_or_explain(str(source))
 
 
 def _sample(args: argparse.Namespace) -> int:
