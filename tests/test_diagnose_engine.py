@@ -23,7 +23,7 @@ from pred_core.diagnose.naming import exploratory, one_recording, why_not
 from pred_core.diagnose.places import Start
 from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.roll import Roller
-from pred_core.diagnose.rounds import finish
+from pred_core.diagnose.rounds import explains_well, finish
 from pred_core.diagnose.run import diagnose, moved_markers
 from pred_core.diagnose.said import sentence
 from pred_core.diagnose.sample import Sample, make_sample
@@ -340,6 +340,30 @@ def test_one_recording_is_exploratory_and_says_so(twin: Twin) -> None:
         assert why_not(wide, 0.001, 1.5, 8.5, progress) == ("" if said else "its interval includes no change")
         # It leaves 9 of a loss; if the simulation without it leaves 8.8, what it saves it saves beside a wrong value.
         assert why_not(wide, 0.001, 0.3, 8.5, progress).startswith("leaves 9.000 of the loss, where 8.800")
+
+
+
+def test_without_a_reference_a_cause_must_save_more_where_the_twin_is_good(
+    twin: Twin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What engine and object have apart may carry a name, so a quarter of the error is asked for; but where the twin
+    explains less than is usual with nothing hidden something is lacking, and a tenth will do.
+    """
+    monkeypatch.setattr("pred_core.diagnose.rounds.WELL", 0.9)
+    splits = ("train",) * 9 + ("test",) * 3
+    rejected = {}
+    for coefficient in (0.3, 6.0):
+        suspect = recorded(twin, drag(coefficient=coefficient), splits, frames=40, size=0.16)
+        journal = Journal(None, {})
+        journal.known["base"] = values_of(twin)
+        bench = commission(twin, suspect, [], SMALL, quiet, journal)
+        progress = Progress(bench, journal, [bench.twin], well=explains_well(bench))
+        for saved in (1.5, 0.8):  # of a loss of 10
+            candidate = judged(twin, "drag_linear", 1.5, 1.0, [saved] * 12)
+            rejected[coefficient, saved] = why_not(candidate, 0.001, 10.0, 0.0, progress)
+    assert rejected[6.0, 1.5] == ""
+    assert rejected[0.3, 1.5] == "saves too little (1.500 of the loss, 2.500 needed)"
+    assert rejected[6.0, 0.8] == "saves too little (0.800 of the loss, 1.000 needed)"
 
 
 # The whole ------------------------------------------------------------------------------------------------------------

@@ -73,7 +73,7 @@ def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress
     first = progress.rounds[0] if progress.rounds else None
     without = floor + excess
     whole = max(excess, 0.0) if first is None or cold else max(float(first.base.mean()) - first.floor, excess, 0.0)
-    least = max((config.cold_gate if cold else config.gate) * whole, STANDING * floor)
+    least = max((config.cold_gate if cold and progress.well else config.gate) * whole, STANDING * floor)
     if without - j.left < HALF * least:  # what it saves beside the reference's value is not saved beside "off"
         return f"leaves {j.left:.3f} of the loss, where {without:.3f} are left without it"
     acting = int(j.acts.sum())

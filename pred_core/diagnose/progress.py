@@ -49,6 +49,7 @@ class Progress:
     unknown: bool = False
     unknown_p: float = 1.0
     explained: float | None = None  # share of the motion, in the end; None: the object hardly moves
+    well: bool = True  # the twin of this round explains the motion as far as is usual where nothing is hidden
     notes: list[str] = field(default_factory=list)
 
     def add(self, named: Named, bench: Bench) -> None:

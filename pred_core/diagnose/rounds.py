@@ -64,6 +64,7 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
     floor = float(_reference_losses(bench).mean()) if bench.reference is not None else 0.0
     if progress.rounds and not _something_left(progress, base, floor):
         return False
+    progress.well = explains_well(bench)
     named = [i for n in progress.named for i in n.judged.trial.ids]
     options = candidates(bench, named)
     screened = []
@@ -98,6 +99,12 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
         return False
     progress.add(found, extend(bench, found.judged))
     return True
+
+
+def explains_well(bench: Bench) -> bool:
+    """Whether the twin explains the motion as far as is usual where nothing is hidden; a cause must then save more."""
+    found = skill_of(bench.twin, bench.target.roller, bench.config.stride)
+    return found is None or found.share >= WELL
 
 
 def _something_left(progress: Progress, base: Array, floor: float) -> bool:
