@@ -21,7 +21,7 @@ from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Screened, judge, screen
 from pred_core.diagnose.naming import exploratory, one_recording, why_not
 from pred_core.diagnose.places import Start
-from pred_core.diagnose.progress import Progress
+from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.rounds import explains_well, finish
 from pred_core.diagnose.run import diagnose, moved_markers
@@ -311,10 +311,19 @@ def test_without_a_reference_a_small_misfit_is_not_called_unknown(
         finish(progress)
         assert float(bench.standing().mean()) > 0.9  # from 0.88 and 1.08 on the loss alone calls them unknown
         said[progress.unknown] = progress.explained
+        assert progress.left == progress.unknown
+        progress.named = [Named(judged(twin, "drag_linear", 1.5, 1.0, [1.0] * len(SPLITS)), 0.001, (), 0.7, 0)]
+        with monkeypatch.context() as patch:
+            patch.setattr("pred_core.diagnose.rounds.POOR", 0.0)  # a base that is of use
+            finish(progress)  # with a name it is not unknown; what is left beside it is still said
+        assert not progress.unknown and progress.left == (coefficient == 6.0)
     assert set(said) == {True, False} and said[True] < 0.9 <= said[False]
     none = dataclasses.replace(answer(twin, dragged, "none"), causes=(), explained=0.968)
     cold, known = (dataclasses.replace(none, errors=with_errors(none, [4.0], [4.0], floor)) for floor in (None, 3.0))
     assert "explains 97% of the motion" in sentence(cold) and "of the motion" not in sentence(known)
+    named = answer(twin, dragged)
+    rest = "Something else is left that no candidate explains."
+    assert rest in sentence(dataclasses.replace(named, more=True)) and rest not in sentence(named)
 
 
 def test_what_hardly_moves_says_nothing_of_a_twin(twin: Twin) -> None:

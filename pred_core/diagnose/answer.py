@@ -76,7 +76,7 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         twin=_twin(study, progress, causes),
         seconds=0.0,
         seed=config.seed,
-        more=progress.unknown and outcome in ("named", "group"),
+        more=(progress.unknown or progress.left) and outcome in ("named", "group"),
         explained=progress.explained,
         settings=to_mapping(config),
     )

@@ -47,6 +47,7 @@ class Progress:
     named: list[Named] = field(default_factory=list)
     rounds: list[Round] = field(default_factory=list)
     unknown: bool = False
+    left: bool = False  # without a reference: in the end the twin explains less than is usual where nothing is hidden
     unknown_p: float = 1.0
     explained: float | None = None  # share of the motion, in the end; None: the object hardly moves
     well: bool = True  # the twin of this round explains the motion as far as is usual where nothing is hidden

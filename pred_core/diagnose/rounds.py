@@ -124,8 +124,8 @@ def finish(progress: Progress) -> None:
     poor = found is not None and found.share < POOR
     if bench.reference is None:
         well = found is not None and found.share >= WELL
-        loud = not progress.named and not well and float(bench.standing().mean()) > _counts(bench, UNEXPLAINED)
-        progress.unknown = loud or poor
+        progress.left = not well and float(bench.standing().mean()) > _counts(bench, UNEXPLAINED)
+        progress.unknown = (progress.left and not progress.named) or poor
         return
     suspect, reference = bench.standing(), _reference_losses(bench)
     if min(len(suspect), len(reference)) < FEWEST:
