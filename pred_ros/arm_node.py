@@ -1,12 +1,14 @@
 """The arm: follows a plan or commanded poses through the guard; a dry run unless told otherwise.
 
 In: plan/trajectory or gripper/command. Out: gripper/pose, gripper/closed, joint_states, /diagnostics.
-`~/enable` (SetBool) arms and disarms, `~/stop` (Trigger) latches a stop, `~/reset` (Trigger) clears a latched fault.
+`~/enable` (SetBool) arms and disarms, `~/stop` (Trigger) latches a stop, `~/reset` (Trigger) clears a latched fault
+and connects again to an arm whose connection was lost.
 The node starts disarmed, and after a fault it moves only when a person has called reset and then enable.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from dataclasses import dataclass, fields
@@ -20,12 +22,13 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from pred_core.arm import orientation
+from pred_core.arm.disconnected import DisconnectedArm
 from pred_core.arm.dry_run import DryRunArm
 from pred_core.arm.follower import Follower
 from pred_core.arm.guard import Guard, Mode
 from pred_core.arm.limits import GuardConfig, bounds_of
 from pred_core.arm.placement import Placement
-from pred_core.arm.plant import HOST, PORT, connect_plant
+from pred_core.arm.plant import HOST, PATIENCE, PORT, STARTING, connect_plant
 from pred_core.arm.protocol import Arm, Reading
 from pred_core.arm.step_check import StepCheck
 from pred_core.arm.ur import connect_ur
@@ -61,13 +64,16 @@ class ArmConfig(GuardConfig):
     autostart: bool = setting(True, doc="configure and activate without a lifecycle manager")
 
 
-def make_arm(config: ArmConfig) -> Arm:
-    """The arm a configuration names. Raises: ConfigError, or InputError if its controller does not answer."""
+def make_arm(config: ArmConfig, patience: float = STARTING) -> Arm:
+    """The arm a configuration names; a plant that is started now has `patience` [s].
+
+    Raises: ConfigError, or InputError if its controller does not answer.
+    """
     if config.arm == "dry_run":
         home = np.array([config.home_x, config.home_y, config.home_z])
         return DryRunArm(home, orientation.DOWN if config.tool_down else orientation.UP)
     if config.arm == "plant":
-        return connect_plant(config.host or HOST, config.port)
+        return connect_plant(config.host or HOST, config.port, patience)
     if not config.host:
         raise ConfigError(f"parameter 'host' is empty, arm '{config.arm}' needs one", next_step="-p host:=192.168.1.2")
     base = np.array([config.base_x, config.base_y, config.base_z])
@@ -93,6 +99,7 @@ class ArmNode(Shell):
         self._closed: bool | None = None  # as published last
         self._measured = -1  # [ns] of the pose that was published last
         self._said: tuple[Mode, str] | None = None
+        self._broken = False  # the arm could not be read
 
     def setup(self) -> None:
         """Check the limits, connect, make the publishers and services."""
@@ -230,6 +237,8 @@ class ArmNode(Shell):
         try:
             if self._following and self._guard.mode is Mode.FAULT:
                 raise InputError("cannot reset: still coming to rest", next_step="Try again in a second")
+            if self._broken:
+                self._connect_again()
             self._guard.reset()
             self._follower.clear()
         except InputError as error:
@@ -237,6 +246,18 @@ class ArmNode(Shell):
         else:
             response.success, response.message = True, self._guard.line
         return response
+
+    def _connect_again(self) -> None:
+        """A new connection instead of a lost one, for the person who resets. Raises: InputError if nobody answers."""
+        assert self._arm is not None
+        with contextlib.suppress(InputError):
+            self._arm.close()
+        try:
+            self._arm = make_arm(self.config, PATIENCE)
+        except InputError as error:
+            self._arm = DisconnectedArm(str(error))
+            raise
+        self._broken = False
 
     def _tick(self) -> None:
         now = self._now()
@@ -247,7 +268,7 @@ class ArmNode(Shell):
         self._drive(now)
         if (self._guard.mode, self._guard.line) != self._said:
             self._said = (self._guard.mode, self._guard.line)
-            self.report(LEVELS.get(self._guard.mode, OK), self._guard.line)
+            self.report(WARN if self._guard.clipped else LEVELS.get(self._guard.mode, OK), self._guard.line)
 
     def _read(self, now: int) -> Reading | None:
         """Read and publish; None, and the arm is stopped, if it cannot be read or would not follow."""
@@ -255,8 +276,10 @@ class ArmNode(Shell):
         try:
             reading = self._arm.read()
         except InputError as error:
+            self._broken = True
             self._lost(str(error))
             return None
+        self._broken = False
         stamp = now if reading.stamp is None or abs(reading.stamp - now) > OTHER_CLOCK else reading.stamp
         if stamp != self._measured:  # the arm may be asked more often than it measures
             self._measured = stamp

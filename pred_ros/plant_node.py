@@ -3,7 +3,8 @@
 Out: camN/color/image_raw, camN/depth/image_raw, camN/color/camera_info, camN/pose, /clock; with `drive: command` also
 what an arm's driver publishes (gripper/pose, gripper/closed, joint_states), which with `drive: controller` comes from
 the arm node (arm:=plant) that commands through the controller's port.
-In: gripper/command, with `drive: command`. On a free clock the gripper goes there; in lock-step time stands still until
+In: gripper/command, with `drive: command`. On a free clock the gripper goes there, if the stamp (of /clock) is of now
+and the place near, and stops 0.1 s after the last one; in lock-step time stands still until
 a command comes with a later stamp, which is when the gripper shall be there, or until `~/step`.
 Services: ~/reset (another start, by the seed), ~/step, ~/slip (the rope slips out of the jaws), ~/jaws (SetBool),
 ~/clear (ends a fault of the arm). Parameters dead_cameras, bumped_cameras, factor and seed may change at any time.
@@ -17,6 +18,7 @@ from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 from geometry_msgs.msg import PoseArray
+from numpy.typing import NDArray
 from std_srvs.srv import SetBool, Trigger
 
 from pred_core.bag.wire import GRIPPER_COMMAND
@@ -36,6 +38,8 @@ from pred_ros.shell import Shell
 
 SLOW = 0.8  # of the factor asked for
 LONGEST = 10.0  # [s] a command may lie ahead in lock-step
+STALE, AHEAD = 0.1, 0.1  # [s] on a free clock: age of a command, and how far its stamp may lie ahead
+JUMP = 0.1  # [m] on a free clock: from the gripper to a command
 LIVE = ("dead_cameras", "bumped_cameras", "factor", "seed")  # parameters that may change at any time
 
 
@@ -214,6 +218,7 @@ class PlantNode(Shell):
         stamp, position, rotation = arm_messages.message_to_command(message)
         pose, station = make_pose(np.array(position), np.array(rotation)), self._station
         if self.config.clock == "free":
+            self._check_command(stamp, np.array(position))
             station.servo.command(pose, np.zeros(3), np.zeros(3), station.cell.time)
             return "followed"
         ahead = (stamp - station.stamp) * 1e-9
@@ -226,6 +231,25 @@ class PlantNode(Shell):
         for moment in station.advance(pose, round(ahead / TICK)):
             self._topics.publish(moment)
         return "reached"
+
+    def _check_command(self, stamp: int, position: NDArray[np.float64]) -> None:
+        """Raises: InputError for a command of another time than now, or far from the gripper."""
+        age = (self._station.stamp - stamp) * 1e-9
+        if not -AHEAD <= age <= STALE:
+            raise InputError(
+                f"{GRIPPER_COMMAND}: stamp",
+                got=f"{age:.3f} s old" if age > 0.0 else f"{-age:.3f} s ahead",
+                allowed=f"at most {STALE:g} s old, {AHEAD:g} s ahead",
+                next_step="Stamp it with the time of /clock (use_sim_time)",
+            )
+        off = float(np.linalg.norm(position - self._station.moment.truth.gripper.position))
+        if off > JUMP:
+            raise InputError(
+                f"{GRIPPER_COMMAND}: far from the gripper",
+                got=f"{off:.3f} m",
+                allowed=f"{JUMP:g} m",
+                next_step="Send poses on the way there, in metres",
+            )
 
     def _slip(self) -> str:
         self._station.cell.jaws.slip()

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn, Protocol, cast
 
 import rclpy
+import rclpy.utilities
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.exceptions import InvalidParameterTypeException, ParameterUninitializedException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -27,7 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from pred_core.errors import PredError
+from pred_core.errors import ConfigError, PredError
 from pred_ros import parameters
 from pred_ros.diagnostics import ERROR, OK, WARN, Diagnostics
 from pred_ros.processes import END_WITH_PARENT
@@ -36,6 +37,7 @@ BAD_INPUT = 2
 POLL = 0.05  # [s] how soon a signal or the end of the work is noticed
 REFUSAL_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
 REFUSED = "refused message"
+HOW = "Give parameters as: {} --ros-args -p NAME:=VALUE, or --params-file FILE"
 
 
 class NodeConfig(Protocol):
@@ -227,9 +229,9 @@ def run(node_class: type[Shell], args: list[str] | None = None) -> int:
     asked: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _: asked.append(received))
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     node: Shell | None = None
     try:
+        _begin(node_class.NAME, args)
         node = node_class()
         return _spin(node, asked)
     except PredError as error:
@@ -244,6 +246,17 @@ def run(node_class: type[Shell], args: list[str] | None = None) -> int:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _begin(name: str, args: list[str] | None) -> None:
+    """Start the client library. Raises: ConfigError for arguments that it cannot read, or that are not for it."""
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except (RuntimeError, ValueError) as error:  # its own kinds of errors derive from these
+        raise ConfigError("ROS arguments", got=str(error).split(", at /")[0], next_step=HOW.format(name)) from error
+    stray = rclpy.utilities.remove_ros_args(args)[1 if args is None else 0 :]
+    if stray:
+        raise ConfigError("arguments that no node has", got=" ".join(stray), next_step=HOW.format(name))
 
 
 def main(node_class: type[Shell]) -> NoReturn:

@@ -75,6 +75,7 @@ def with_value(name: str, index: tuple[int, int], value: float) -> dict[str, Any
         (with_value("position", (1, 1), 0.2), "jumps after point 0; got 200.0 mm"),
         (points(rotation=np.array([DOWN, DOWN, (0.0, 0.0, 1.0, 0.0)])), "jumps after point 1"),
         (points(position=np.zeros((2, 3))), "one pose per point"),
+        (points(position=points()["position"] - (0.0, 0.0, 0.24)), "leaves the workspace at point 0; got [0.45, 0.0,"),
     ],
 )
 def test_plans_that_are_refused_with_one_line(values: dict[str, Any], word: str) -> None:
@@ -93,12 +94,20 @@ def test_a_plan_must_begin_where_the_arm_will_be() -> None:
         follower = Follower(CONFIG, lifetime=3.0)
         follower.accept(plan_of(first=1.0), (np.array(HOME) + (0.0, 0.2, 0.0), DOWN), 0)
     with pytest.raises(InputError, match="too far ahead; got 3.100 s; allowed: 3 s"):
-        follower.accept(plan_of(first=3.1), HERE, 0)
-    follower.accept(plan_of(first=2.9), HERE, 0)
+        follower.accept(plan_of(start=2_500_000_000, first=0.6), HERE, 0)
+    follower.accept(plan_of(start=2_500_000_000, first=0.4), HERE, 0)
     with pytest.raises(InputError, match="lies in the past; got it ended 0.100 s ago"):
         follower.accept(plan_of(), HERE, 1_300_000_000)
-    with pytest.raises(InputError, match="too old; got 3.500 s"):
-        follower.accept(plan_of(seconds=4.0), HERE, 3_500_000_000)
+
+
+def test_a_plan_that_would_be_cut_off_is_refused_and_one_that_just_fits_is_followed_to_its_end() -> None:
+    """The lifetime is 3 s from the stamp; the last point comes 0.2 s after the motion."""
+    follower = Follower(CONFIG, lifetime=3.0)
+    with pytest.raises(InputError, match="too long; got 3.200 s from its stamp.*allowed: 3 s.*lifetime:=4.0"):
+        follower.accept(plan_of(first=2.0), HERE, 0)
+    follower.accept(plan_of(first=1.8), HERE, 0)  # ends at 3.0 s
+    target = follower.target(3 * NS, 0.0)
+    assert target is not None and target[0] == pytest.approx((0.55, 0.0, 0.25)) and follower.done(3 * NS)
 
 
 def test_the_next_plan_waits_for_its_time() -> None:
@@ -119,9 +128,6 @@ def test_what_runs_out_asks_for_nothing() -> None:
     follower.accept(moving, HERE, 0)
     assert follower.target(NS, 0.0) is not None and follower.target(NS + 1, 0.0) is None
     assert follower.target(NS - 10**8, 0.2) is None and not follower.done(2 * NS)
-    follower.clear()
-    follower.accept(plan_of(seconds=5.0), HERE, 0)
-    assert follower.target(3 * NS, 0.0) is not None and follower.target(3 * NS + 1, 0.0) is None
     follower.clear()
     follower.accept(plan_of(), HERE, 0)
     assert follower.target(NS + 10**8, 0.2) is not None  # ends at rest: it may wait there

@@ -29,7 +29,7 @@ from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import stamp_of
 from pred_core.errors import InputError
 from pred_ros import arm_node, convert, qos
-from pred_ros.arm_node import ArmNode
+from pred_ros.arm_node import ArmConfig, ArmNode
 from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.processes import free_domain, node_command, node_environment
 
@@ -170,7 +170,7 @@ def test_stop_disable_and_reset() -> None:
 
 
 def test_commands_are_followed_and_bad_ones_named() -> None:
-    with arm_world(source="command") as world:
+    with arm_world(source="command", z_high=0.3) as world:
         assert world.enable().success
         goal = HOME + (0.0, 0.03, 0.0)
         end = time.monotonic() + 1.0
@@ -178,6 +178,11 @@ def test_commands_are_followed_and_bad_ones_named() -> None:
             world.send_command(goal)
             world.wait(0.02)
         assert world.place() == pytest.approx(goal, abs=1e-6)
+        far = world.place() + (0.0, 0.0, 0.2)  # led there in steps, above the workspace of 0.3 m
+        for share in np.linspace(0.0, 1.0, 40):
+            world.send_command(goal + share * (far - goal))
+            world.wait(0.03)
+        world.bench.until(lambda: world.bench.says(WARN, "held at a limit: workspace"), "it is held, and says so")
         world.send_command(goal, age=0.3)
         world.bench.until(lambda: world.bench.says(WARN, "old"), "a late command is named")
         world.send_command(np.array([np.nan, 0.0, 0.0]))
@@ -191,6 +196,10 @@ def test_bad_plans_are_refused_with_one_line() -> None:
         world.bench.until(lambda: world.bench.says(WARN, "another frame", "'base_link'"), "the frame")
         world.send_plan(np.array([0.5, 0.0, 0.0]), 0.2)
         world.bench.until(lambda: world.bench.says(WARN, "plan jumps after point 0"), "the jump")
+        world.send_plan(np.array([0.0, 0.0, -0.24]), 2.0)
+        world.bench.until(lambda: world.bench.says(WARN, "leaves the workspace"), "under the table")
+        world.send_plan(np.array([0.1, 0.0, 0.0]), 4.0)
+        world.bench.until(lambda: world.bench.says(WARN, "too long", "lifetime:=5.0"), "it would be cut off")
         world.plan_out.publish(MultiDOFJointTrajectory(header=convert.header_at(world.now()), joint_names=["a", "b"]))
         world.bench.until(lambda: world.bench.says(WARN, "one gripper an arm"), "two grippers")
         world.plan_out.publish(MultiDOFJointTrajectory(header=convert.header_at(world.now()), joint_names=["a"]))
@@ -264,6 +273,32 @@ def test_a_troubled_arm_is_stopped_at_once(how: str, monkeypatch: pytest.MonkeyP
         arm.trouble, arm.lost = "", False
         world.wait(0.3)
         assert arm.calls == ["stop"] and world.guard.mode is Mode.FAULT  # nothing comes back by itself
+
+
+def test_reset_connects_again_to_a_lost_arm(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plant was started anew: the person who resets gets a new connection; while nobody answers, reset says so."""
+    first, second = Troubled(HOME, DOWN), Troubled(HOME, DOWN)
+    answers: list[Troubled] = [first]
+
+    def connect(config: ArmConfig, patience: float = 0.0) -> Troubled:
+        if not answers:
+            raise InputError("plant: nobody at 127.0.0.1:7654")
+        return answers.pop()
+
+    monkeypatch.setattr(arm_node, "make_arm", connect)
+    with arm_world() as world:
+        world.bench.until(lambda: bool(world.joints), "joint_states")
+        assert world.enable().success
+        first.lost = True
+        world.bench.until(lambda: world.guard.mode is Mode.FAULT, "it is noticed")
+        refused = world.trigger("reset")
+        assert not refused.success and "nobody at" in refused.message and world.guard.mode is Mode.FAULT
+        answers.append(second)
+        assert world.trigger("reset").success
+        world.wait(0.1)  # the ticks read the new one
+        assert world.guard.mode is Mode.DISARMED and world.enable().success
+        world.wait(0.1)
+        assert world.guard.mode is Mode.HOLDING
 
 
 def test_a_configuration_that_cannot_be_ends_the_process_with_one_line() -> None:

@@ -159,6 +159,23 @@ def run_node(node: type[shell.Shell], *parameters: str) -> int:
         return shell.run(node, arguments)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--ros-args", "--params-file", "nofile.yaml"], "nofile.yaml"),
+        (["--ros-args", "-p", "length"], "-p length"),
+        (["--length", "0.7", "--ros-args", "-p", "rate:=50.0"], "arguments that no node has; got --length 0.7"),
+    ],
+)
+def test_arguments_that_are_no_parameters(
+    arguments: list[str], word: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with own_domain():
+        assert shell.run(ArmNode, arguments) == 2
+    line = capfd.readouterr().err.strip().splitlines()[-1]
+    assert line.startswith("arm: ") and word in line and "arm --ros-args -p NAME:=VALUE" in line
+
+
 STARTS = [
     (PlayerNode, (), "parameter 'bag' is empty"),
     (PlayerNode, ("bag:=/no/such/bag.mcap",), "no such bag"),

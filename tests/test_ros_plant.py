@@ -171,6 +171,18 @@ def test_a_bad_command_is_named_and_the_plant_goes_on() -> None:
         message.poses = [*message.poses, *message.poses]
         world.command_out.publish(message)
         world.bench.until(lambda: world.bench.says(WARN, "one gripper an arm", "2 poses"), "the number")
+        message = convert.pose_to_message(PoseFrame(1, world.place()[None], np.array([[0.0, 1, 0, 0]])))
+        world.command_out.publish(message)
+        world.bench.until(lambda: world.bench.says(WARN, "stamp", "old", "use_sim_time"), "a stamp of another clock")
+        here = world.place()
+
+        def far() -> bool:  # the stamp must be of now, however busy the machine is
+            world.command(1000.0 * here, 0.0)
+            world.bench.executor.spin_once(timeout_sec=0.02)
+            return bool(world.bench.says(WARN, "far from the gripper", "in metres"))
+
+        world.bench.until(far, "millimetres")
+        assert np.linalg.norm(world.place() - here) < 1e-3, "it has moved on a bad command"
         world.command(np.array([np.nan, 0.0, 0.1]), 0.0)
         world.bench.until(lambda: world.bench.says(WARN, "finite"), "NaN")
         now = world.clock[-1]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pred_core.arm.limits import GuardConfig
+from pred_core.arm.limits import GuardConfig, bounds_of
 from pred_core.arm.orientation import Quaternion, angle_between, slerp
 from pred_core.errors import InputError
 
@@ -18,6 +19,7 @@ WORLD = "world"
 UNIT_TOLERANCE = 1e-3  # of a quaternion's norm, as in the bag contract
 OVER = 1.5  # a plan may ask for this times the speed limit between two points; the guard lags behind it
 REST = 1e-6  # [m], [rad] between the last two points of a plan that ends at rest
+OUTSIDE = 0.005  # [m] a plan may leave the workspace by, as a measured beginning may; the guard keeps the arm inside
 MOST_WAITING = 100  # plans not yet begun
 
 
@@ -81,6 +83,7 @@ def make_plan(
         raise InputError("plan has a quaternion without unit norm", got=norm[:6].tolist(), allowed="1 +- 0.001")
     plan = Plan(start, moments, np.asarray(position, float), rotation / norm[:, None])
     _check_jumps(plan, config)
+    _check_place(plan, config)
     return plan
 
 
@@ -109,13 +112,19 @@ class Follower:
         """Follow a plan from its first point on, instead of those that would begin later. `here`: the present
         set-point, `now` [ns].
 
-        Raises: InputError for a plan that is over, too old, begins too far ahead or where the arm cannot be by then, or
-        is one too many.
+        Raises: InputError for a plan that is over, too long to be followed to its end, begins too far ahead or where
+        the arm cannot be by then, or is one too many.
         """
         if plan.end <= now:
             raise InputError("plan lies in the past", got=f"it ended {(now - plan.end) / NS:.3f} s ago")
-        if now - plan.start > self._lifetime * NS:
-            raise InputError("plan is too old", got=f"{(now - plan.start) / NS:.3f} s", allowed=f"{self._lifetime:g} s")
+        length = (plan.end - plan.start) / NS
+        if length > self._lifetime:  # it would be cut off on the way
+            raise InputError(
+                "plan is too long",
+                got=f"{length:.3f} s from its stamp to its end",
+                allowed=f"{self._lifetime:g} s",
+                next_step=f"Send it in parts, or start the arm with -p lifetime:={math.ceil(length)}.0",
+            )
         if plan.begin - now > self._lifetime * NS:
             raise InputError(
                 "plan begins too far ahead",
@@ -165,6 +174,19 @@ class Follower:
         """The plan in force ended at rest, and nothing follows it."""
         plan = self._plan
         return plan is not None and not self._waiting and plan.ends_at_rest and now >= plan.end
+
+
+def _check_place(plan: Plan, config: GuardConfig) -> None:
+    bounds = bounds_of(config)
+    out = np.maximum(bounds.low - plan.position, plan.position - bounds.high).max(axis=1)
+    k = int(out.argmax())
+    if out[k] > OUTSIDE:
+        raise InputError(
+            f"plan leaves the workspace at point {k}",
+            got=f"{np.round(plan.position[k], 4).tolist()} m, {1e3 * out[k]:.0f} mm outside",
+            allowed=f"{bounds.low.tolist()} to {bounds.high.tolist()} m",
+            next_step="Plan inside the arm's workspace, or set its x_low to z_high",
+        )
 
 
 def _check_jumps(plan: Plan, config: GuardConfig) -> None:

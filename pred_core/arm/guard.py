@@ -47,6 +47,7 @@ class Guard:
         self.mode = Mode.DISARMED
         self.line = "not armed yet"
         self.counts: Counter[str] = Counter()
+        self.clipped = ""  # what limit the newest command went beyond; "" if none
         self._upright = orientation.DOWN if config.tool_down else orientation.UP
         self._smoother: Smoother | None = None
         self._reference = np.zeros(6)  # position [m], tilt and yaw [rad]
@@ -118,21 +119,23 @@ class Guard:
         """The stream of commands has ended well: go to the last target and wait there, without a watchdog."""
         if self.mode in (Mode.MOVING, Mode.RAMPING):
             self._watched = self._asked = None
-            self.mode, self.line = Mode.HOLDING, Mode.HOLDING.value
+            self.clipped, self.mode, self.line = "", Mode.HOLDING, Mode.HOLDING.value
 
     def command(self, position: Sequence[float] | Array, rotation: Sequence[float], stamp: int, now: int) -> str | None:
         """Take a commanded pose (3,) [m] world, wxyz, of `stamp` at `now` [ns]. Returns None, or why it was refused.
 
         Not armed, late, early or out of order: ignored, and the watchdog goes on. Malformed, or a jump: a fault.
-        Outside the workspace or the cone: clipped to its edge, and counted.
+        Outside the workspace or the cone: clipped to its edge, counted, and said in `line` while it lasts.
         """
         if self.mode in (Mode.DISARMED, Mode.FAULT):
             return self._refuse("not armed", f"not armed: {self.line}")
         age = (now - stamp) / NS
         if age > self.config.ramp_after:
-            return self._refuse("late", f"command is {age:.3f} s old")
+            allowed = f"allowed: {self.config.ramp_after:g} s; check the sender's clock, and use_sim_time on both"
+            return self._refuse("late", f"command is {age:.3f} s old; {allowed}")
         if -age > self.config.ahead:
-            return self._refuse("from the future", f"command is {-age:.3f} s in the future")
+            allowed = f"allowed: {self.config.ahead:g} s; check the sender's clock, and use_sim_time on both"
+            return self._refuse("from the future", f"command is {-age:.3f} s in the future; {allowed}")
         if self._asked is not None and stamp <= self._asked[0]:
             return self._refuse("out of order", f"stamp goes back by {(self._asked[0] - stamp) / NS:.3f} s")
         try:
@@ -145,12 +148,13 @@ class Guard:
             self.stop(jump)
             return self._refuse("jump", jump)
         target, clipped = self._clip(place, turned, float(self._reference[5]))
-        if clipped is not None:
-            self.counts[f"clipped: {clipped[0]}"] += 1
+        self.clipped = "" if clipped is None else clipped[0]
+        if self.clipped:
+            self.counts[f"clipped: {self.clipped}"] += 1
         self._target = target
         self._asked, self._watched = (stamp, place, turned), stamp
-        if self.mode is not Mode.MOVING:
-            self.mode, self.line = Mode.MOVING, Mode.MOVING.value
+        self.mode = Mode.MOVING
+        self.line = f"{Mode.MOVING.value}, held at a limit: {self.clipped}" if self.clipped else Mode.MOVING.value
         return None
 
     def measured(self, position: Array, rotation: Quaternion) -> None:
@@ -220,6 +224,7 @@ class Guard:
         return self._setpoint
 
     def _freeze(self, mode: Mode, line: str) -> None:
+        self.clipped = ""
         self._target = self._reference.copy()
         self.mode, self.line = mode, line
         if mode is not Mode.RAMPING:

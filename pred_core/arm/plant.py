@@ -16,7 +16,7 @@ from pred_core.errors import InputError
 HOST, PORT = "127.0.0.1", 7654
 PATIENCE = 2.0  # [s] for a reply
 STARTING = 30.0  # [s] to connect: a plant that is started together with the arm is not there yet
-START_IT = "Start the plant node, and give both the same port"
+START_IT = "Start the plant node with the same port; then reset the arm, which connects again"
 
 
 class PlantArm:
@@ -66,6 +66,7 @@ class PlantArm:
             self._connection.sendall(json.dumps(request).encode() + b"\n")
             line = self._replies.readline()
         except OSError as error:
+            self.close()  # a reply that comes late would be taken for that of the next request
             raise InputError("plant: connection lost", got=error, next_step=START_IT) from error
         if not line:
             raise InputError("plant: the controller hung up", next_step=START_IT)
