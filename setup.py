@@ -80,6 +80,7 @@ setup(
             "pred_replay = pred_ros.replay:main",
             "pred_bringup = pred_ros.bringup:main",
             "pred_reroute = pred_ros.reroute:main",
+            "pred_motion = pred_ros.motion:main",
             *(f"{name} = pred_ros.{name}_node:main" for name in NODES),
         ]
     },

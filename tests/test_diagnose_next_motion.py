@@ -186,7 +186,9 @@ def test_an_arm_takes_the_plan_from_the_file(twin: Twin, dragged: list[Episode],
     assert motion is not None
     write_motion(tmp_path / "next_motion.yaml", motion)
     bound = motion["limits"]
-    allowed = GuardConfig(speed=bound["speed"], angular_speed=max(bound["turn_speed"], 0.02))
+    edges = {f"{a}_{e}": bound[e][0][k] for k, a in enumerate("xyz") for e in ("low", "high")}
+    box = {k: v + (0.01 if k.endswith("high") else -0.01) for k, v in edges.items()}
+    allowed = GuardConfig(speed=bound["speed"], angular_speed=max(bound["turn_speed"], 0.02), table=-1.0, **box)
     plan = load_plan(tmp_path / "next_motion.yaml", 7_000_000_000, allowed)
     assert plan.ends_at_rest and plan.begin == 7_000_000_000
     assert plan.end == pytest.approx(plan.begin + 1e9 * LONGEST, abs=2e8)

@@ -1,0 +1,169 @@
+"""`pred_motion next_motion.yaml`: has the arm node execute the motion that `pred diagnose` proposed.
+
+The arm node must run with `source: plan`, be enabled, and allow the motion's speed, acceleration and length. The object
+is in the jaws. The arm goes straight and slowly to where the motion begins, rests there as long as the file says,
+and moves. What the arm refuses, or a fault on the way, ends this with the arm's own line; Ctrl-C stops the arm.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseArray, Quaternion, Transform, Vector3
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
+
+from pred_core.arm.approach import TimedPoses, with_approach
+from pred_core.arm.follower import WORLD
+from pred_core.arm.plan_file import read_motion
+from pred_core.bag.grippers import PoseFrame
+from pred_core.bag.wire import GRIPPER_POSE
+from pred_core.errors import ConfigError, InputError
+from pred_ros import convert, qos
+from pred_ros.arm_messages import PLAN
+from pred_ros.commands import run_command
+from pred_ros.diagnostics import OK
+
+PATIENCE = 10.0  # [s] for the arm node to be there
+AHEAD = 0.3  # [s] between sending and the beginning
+ANSWER = 1.0  # [s] in which a refusal comes
+ARRIVED = 0.02  # [m] from the last pose
+SHOWN = 1.0  # [s] between two lines of progress
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point. Returns 0 done, 2 bad input, a refusal or a fault, 130 interrupted."""
+    parser = argparse.ArgumentParser(prog="pred_motion", description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("file", type=Path, help="next_motion.yaml of pred diagnose")
+    parser.add_argument("--gripper", type=int, default=0, help="whose motion in the file (default: 0)")
+    parser.add_argument("--approach", type=float, default=0.05, metavar="M/S", help="speed to its beginning (0.05)")
+    args = parser.parse_args(argv)
+    return run_command("pred_motion", lambda: go(args))
+
+
+def go(args: argparse.Namespace) -> int:
+    """Read, send, follow to the end. Raises: PredError."""
+    if not 0.001 <= args.approach <= 0.5:
+        raise ConfigError("--approach", got=args.approach, allowed="0.001 to 0.5 m/s")
+    frame, motion, rest = read_motion(args.file, args.gripper)
+    if frame != WORLD:
+        raise InputError(f"{args.file}: another frame", got=repr(frame), allowed=repr(WORLD))
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    sender = Sender()
+    try:
+        sender.execute(motion, args.approach, rest)
+    finally:
+        sender.close()
+        rclpy.try_shutdown()
+    return 0
+
+
+class Sender:
+    """Sends one plan to the arm node and watches it."""
+
+    def __init__(self) -> None:
+        self._node = Node("motion")
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self._pose: PoseFrame | None = None
+        self._said: tuple[bytes, str] | None = None
+        self._node.create_subscription(PoseArray, GRIPPER_POSE, self._on_pose, qos.poses_live())
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        self._stop = self._node.create_client(Trigger, "/arm/stop")
+        self._out = self._node.create_publisher(MultiDOFJointTrajectory, PLAN, qos.plans())
+
+    def close(self) -> None:
+        """Let go of the node."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+
+    def execute(self, motion: TimedPoses, speed: float, rest: float) -> None:
+        """To the beginning with `speed` [m/s], `rest` [s], the motion. Raises: InputError with what went wrong."""
+        if not self._until(lambda: self._pose is not None and self._out.get_subscription_count() > 0, PATIENCE):
+            missing = "plan/trajectory" if self._pose is not None else GRIPPER_POSE
+            raise InputError(
+                f"no arm node: nobody {'reads' if self._pose is not None else 'writes'} {missing}",
+                next_step="Start one: arm --ros-args -p arm:=..., then call /arm/enable",
+            )
+        pose = self._pose
+        assert pose is not None
+        w, x, y, z = (float(v) for v in pose.rotation[0])
+        whole = with_approach(motion, pose.position[0], (w, x, y, z), speed, rest)
+        seconds = float(whole.times[-1])
+        print(f"{seconds:.1f} s, {seconds - float(motion.times[-1] - motion.times[0]):.1f} s of it to the beginning")
+        begin = self._now() + round(AHEAD * 1e9)
+        self._said = None
+        self._out.publish(_message(begin, whole))
+        try:
+            self._follow(begin, seconds)
+        except KeyboardInterrupt:  # the arm would go on to the end of the plan
+            self._stop.call_async(Trigger.Request())
+            self._until(lambda: self._said is not None and self._said[0] != OK, ANSWER)
+            raise
+        off = float(np.linalg.norm(self._place() - whole.position[-1]))
+        if off > ARRIVED:
+            line = "the arm is not where the motion ends"
+            raise InputError(line, got=f"{1e3 * off:.0f} mm off", next_step=self._last())
+        print("done")
+
+    def _follow(self, begin: int, seconds: float) -> None:
+        end, shown = begin + round((seconds + ANSWER) * 1e9), 0.0
+        while self._now() < end:
+            self._executor.spin_once(timeout_sec=0.05)
+            if self._said is not None and self._said[0] != OK:
+                raise InputError(f"arm: {self._said[1]}")
+            gone = (self._now() - begin) * 1e-9
+            if gone - shown >= SHOWN:
+                shown = gone
+                print(f"{min(gone, seconds):.0f} of {seconds:.0f} s", flush=True)
+
+    def _until(self, true: Callable[[], bool], limit: float) -> bool:
+        end = time.monotonic() + limit
+        while time.monotonic() < end:
+            if true():
+                return True
+            self._executor.spin_once(timeout_sec=0.05)
+        return False
+
+    def _now(self) -> int:
+        return int(self._node.get_clock().now().nanoseconds)
+
+    def _place(self) -> np.ndarray:
+        assert self._pose is not None
+        return self._pose.position[0]
+
+    def _last(self) -> str:
+        return "" if self._said is None else f"The arm says: {self._said[1]}"
+
+    def _on_pose(self, message: PoseArray) -> None:
+        self._pose = convert.message_to_pose(message)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.rsplit("/", 1)[-1] == "arm":
+                self._said = (status.level, status.message)
+
+
+def _message(stamp: int, poses: TimedPoses) -> MultiDOFJointTrajectory:
+    points = []
+    for t, (x, y, z), (w, i, j, k) in zip(
+        poses.times.tolist(), poses.position.tolist(), poses.rotation.tolist(), strict=True
+    ):
+        pose = Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(w=w, x=i, y=j, z=k))
+        point = MultiDOFJointTrajectoryPoint(transforms=[pose])
+        point.time_from_start.sec, point.time_from_start.nanosec = divmod(round(t * 1e9), 10**9)
+        points.append(point)
+    return MultiDOFJointTrajectory(header=convert.header_at(stamp), joint_names=["gripper0"], points=points)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
