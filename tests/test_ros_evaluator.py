@@ -24,6 +24,7 @@ from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
 from ros_bench import Bench, bench_of, own_domain
 from std_msgs.msg import String
 
+from pred_core.errors import BagError
 from pred_core.live import marks
 from pred_core.twin import Extension, ResidualWeights, Twin
 from pred_core.types import State
@@ -148,6 +149,14 @@ def test_clouds_survive_the_wire_bit_for_bit() -> None:
     frame = points(3)
     again = convert.cloud_to_points(convert.points_to_cloud(frame))
     assert np.array_equal(again.position, frame.position.astype(np.float32)) and again.stamp == frame.stamp
+
+
+def test_a_state_in_millimetres_is_refused_and_a_prediction_astray_is_scored() -> None:
+    stamp, state = prediction(5)
+    cloud = convert.state_to_cloud(stamp, IDS, state.replace(position=1e3 * state.position))
+    with pytest.raises(BagError, match="state/points: implausible extent, are these millimetres?"):
+        convert.cloud_to_state(cloud, "state/points")
+    assert torch.equal(convert.cloud_to_state(cloud, "prediction/points")[2].position, 1e3 * state.position)
 
 
 def run_node(node: type[shell.Shell], *parameters: str) -> int:

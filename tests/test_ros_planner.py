@@ -294,6 +294,8 @@ def test_bad_states_are_refused_with_the_reason(files: dict[str, str]) -> None:
         world.see()
         world.see(position=broken)
         world.bench.until(lambda: world.bench.says(ERROR, "ids [2] are not finite"), "NaN is named")
+        world.see(position=1e3 * (HOME + LINE))
+        world.bench.until(lambda: world.bench.says(ERROR, "state/points", "are these millimetres?"), "the unit is named")
         world.see(stamp=world.now() - 2_000_000_000)
         world.bench.until(lambda: world.bench.says(ERROR, "state is too old"), "age is named")
         world.see(stamp=world.now() + 300_000_000, pose=False)
