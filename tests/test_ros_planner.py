@@ -295,7 +295,7 @@ def test_bad_states_are_refused_with_the_reason(files: dict[str, str]) -> None:
         world.see(position=broken)
         world.bench.until(lambda: world.bench.says(ERROR, "ids [2] are not finite"), "NaN is named")
         world.see(position=1e3 * (HOME + LINE))
-        world.bench.until(lambda: world.bench.says(ERROR, "state/points", "are these millimetres?"), "the unit is named")
+        world.bench.until(lambda: world.bench.says(ERROR, "state/points", "millimetres?"), "the unit is named")
         world.see(stamp=world.now() - 2_000_000_000)
         world.bench.until(lambda: world.bench.says(ERROR, "state is too old"), "age is named")
         world.see(stamp=world.now() + 300_000_000, pose=False)
@@ -305,6 +305,46 @@ def test_bad_states_are_refused_with_the_reason(files: dict[str, str]) -> None:
         world.goal_out.publish(cloud)
         world.bench.until(lambda: world.bench.says(ERROR, "goal/points", "camera"), "the frame is named")
         assert world.bench.node.exit_code is None
+
+
+def test_grippers_that_change_in_number_are_refused_until_reset(files: dict[str, str]) -> None:
+    """2 grippers at t, 3 at t + 20 ms, a state between them: no traceback, and no pose made up out of both."""
+    with world_of(files) as world:
+        world.goal(HOME + LINE + MOVE)
+        stamp = world.now()
+
+        def pose(at: int, count: int) -> None:
+            place = HOME + np.array([[0.0, 0.1, 0.0]]) * np.arange(count)[:, None]
+            frame = PoseFrame(at, place, np.repeat(DOWN, count, axis=0))
+            world.bench.pose_out.publish(convert.pose_to_message(frame))
+
+        world.bench.until(lambda: world.bench.pose_out.get_subscription_count() >= 1, "the node listens")
+        pose(stamp, 2)
+        pose(stamp + 20_000_000, 3)
+        world.bench.until(
+            lambda: world.bench.says(ERROR, "number of grippers changed", "got 3", "2 as before"), "the change is named"
+        )
+        world.see(stamp=stamp + 10_000_000, pose=False)
+        assert world.ask("reset", Trigger, Trigger.Request()).success and world.enable().success
+        world.live(lambda: world.plans, "plans with one gripper, after a reset")
+        assert world.bench.node.exit_code is None
+
+
+def test_a_gripper_far_from_the_object_or_its_workspace_is_not_planned_for(files: dict[str, str]) -> None:
+    with world_of(files, enabled="true") as world:
+        world.goal(HOME + LINE + MOVE)
+        for up, words in ((5.0, "gripper 0 is outside its workspace"), (0.25, "far from what it is said to hold")):
+            line = HOME + LINE
+            world.moved = np.array([0.0, 0.0, up])
+
+            def said(line: np.ndarray = line, words: str = words) -> bool:
+                world.see(position=line)
+                return world.bench.says(ERROR, words)
+
+            world.bench.until(said, "a line that says so")
+        assert not world.plans
+        world.moved = np.zeros(3)
+        world.live(lambda: world.plans, "a plan once it is there")
 
 
 def test_silence_is_said(files: dict[str, str]) -> None:
