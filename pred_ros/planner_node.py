@@ -35,6 +35,7 @@ from pred_core.plan.planner import Planner
 from pred_core.plan.rollouts import Rollouts
 from pred_core.plan.session import Session, Timing
 from pred_core.plan.task import load_settings, make_planner, planning_dynamics, scene_with_slot, with_gap
+from pred_core.springmass.device import check_device
 from pred_core.twin import Twin
 from pred_core.types import Array, Scene
 from pred_ros import convert, planner_messages, qos, shell
@@ -85,6 +86,7 @@ class PlannerNode(Shell):
             raise TwinError(
                 "parameter 'twin' is empty", next_step="ros2 run pred_ros planner --ros-args -p twin:=FOLDER"
             )
+        check_device(config.device, "parameter 'device'")
         torch.set_num_threads(config.threads)
         self._twin = Twin.load(Path(config.twin))
         settings = load_settings(config.settings)

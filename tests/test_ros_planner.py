@@ -41,6 +41,7 @@ MOVE = np.array([0.06, 0.08, 0.05])  # [m]
 IDS = np.arange(COUNT, dtype=np.uint32)
 LINE = np.column_stack((0.05 * np.arange(COUNT), np.zeros((COUNT, 2))))
 FROM_REST = 0.5 * 1.6 * 0.02**2 + 1e-6  # [m] in the first 20 ms, at 1.6 m/s^2
+CELL_ROPE = Path(__file__).parents[1] / "config" / "twins" / "cell_rope"
 SETTINGS = """
 motion: {horizon: 1.0, knots: 5, speed: 0.2}
 search: {samples: 32, chunk: 16, iterations: 4, frames: 4}
@@ -380,13 +381,15 @@ def test_markers_only_when_asked_for(files: dict[str, str]) -> None:
         ({}, "parameter 'twin' is empty"),
         ({"twin": "/nowhere"}, "not a twin"),
         ({"budgets": 0.1}, "did you mean 'budget'?"),
+        ({"twin": str(CELL_ROPE), "device": "cuda"}, "parameter 'device'; got cuda; allowed: cpu"),
     ],
 )
 def test_a_process_with_bad_parameters_ends_with_one_line(
     tmp_path: Path, parameters: dict[str, Any], words: str
 ) -> None:
+    environment = node_environment(free_domain()) | {"CUDA_VISIBLE_DEVICES": ""}
     done = subprocess.run(
-        node_command("planner", parameters), env=node_environment(free_domain()), capture_output=True, text=True,
+        node_command("planner", parameters), env=environment, capture_output=True, text=True,
         timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 2
