@@ -133,6 +133,7 @@ def test_the_command_writes_plan_and_report(
         (["--goal", "goal.png"], "unknown kind of cloud"),
         (["--shift", "0", "0", "0", "--settings", "typo.yaml"], "did you mean 'samples'?"),
         (["--shift", "0", "0", "0", "--held", "x"], "--held"),
+        (["--shift", "0", "0", "0", "--held", "0:0 0:1"], "--held names a particle twice"),
         (["--shift", "0", "0", "0", "--held", "99:0"], "does not have"),
         (["--shift", "0", "0", "0", "--replans", "0"], "pred: --replans; got 0; allowed: 1 or more."),
         (["--shift", "0", "0", "0", "--seed", "-1"], "pred: --seed; got -1; allowed: 0 or more."),

@@ -202,6 +202,8 @@ def test_held_that_does_not_fit_the_twin_is_refused(tmp_path: Path, capfd: pytes
     assert "particles the twin does not have; got [77]" in capfd.readouterr().err
     assert run_node(PredictorNode, f"twin:={twin}", "held:='zero'") == 2
     assert "pairs like '0:0 1:1 11:2'" in capfd.readouterr().err
+    assert run_node(PredictorNode, f"twin:={twin}", "held:='0:0 0:1'") == 2
+    assert "parameter 'held' names a particle twice; got '0:0 0:1'" in capfd.readouterr().err
 
 
 def test_parameters_change_all_or_none(bench: Bench) -> None:
