@@ -272,6 +272,7 @@ def test_an_unusable_goal_is_refused_and_a_good_one_helps(
         world.goal(goal)
         world.live(lambda: world.bench.says(ERROR, *words), "an error that says why")
         assert not world.plans and world.bench.node.exit_code is None
+        world.live(lambda: world.bench.says(WARN, "no usable goal"), "a warning that stays, once the error is told")
         world.goal(HOME + LINE + MOVE)
         world.live(lambda: world.plans, "a plan to the good goal")
 
@@ -346,6 +347,19 @@ def test_a_gripper_far_from_the_object_or_its_workspace_is_not_planned_for(files
         assert not world.plans
         world.moved = np.zeros(3)
         world.live(lambda: world.plans, "a plan once it is there")
+
+
+def test_an_error_that_is_over_does_not_stay_the_headline(files: dict[str, str]) -> None:
+    """One pose of another frame while the node has planned and nothing new comes to plan from."""
+    with world_of(files, enabled="true", max_age="60.0", pose_gap="1.0") as world:
+        world.goal(HOME + LINE + MOVE)
+        world.live(lambda: world.plans, "a plan")
+        stranger = convert.pose_to_message(PoseFrame(world.now(), HOME[None], DOWN))
+        stranger.header.frame_id = "base_link"
+        world.bench.pose_out.publish(stranger)
+        world.bench.until(lambda: world.bench.says(ERROR, "refused", "base_link"), "the frame is named")
+        world.bench.until(lambda: world.bench.statuses[-1].level == WARN, "the error is over", 10.0)
+        assert "no plan since the last error" in world.bench.statuses[-1].message
 
 
 def test_silence_is_said(files: dict[str, str]) -> None:
