@@ -160,8 +160,8 @@ class PlannerNode(Shell):
             self.report(OK, f"goal reached: {1e3 * (self._session.distance or 0.0):.1f} mm")
         elif not self._session.has_goal:
             self.report(WARN, f"no usable goal; publish another one on {GOAL_POINTS}")
-        elif self.diagnostics.level == ERROR:  # it is over, and nothing was planned since
-            self.report(WARN, "enabled; no plan since the last error")
+        elif self.diagnostics.level == ERROR:  # it is over, and nothing new was planned
+            self.report(WARN, "enabled; no new plan")
 
     def _now(self) -> int:
         return int(self.get_clock().now().nanoseconds)

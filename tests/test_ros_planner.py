@@ -359,7 +359,7 @@ def test_an_error_that_is_over_does_not_stay_the_headline(files: dict[str, str])
         world.bench.pose_out.publish(stranger)
         world.bench.until(lambda: world.bench.says(ERROR, "refused", "base_link"), "the frame is named")
         world.bench.until(lambda: world.bench.statuses[-1].level == WARN, "the error is over", 10.0)
-        assert "no plan since the last error" in world.bench.statuses[-1].message
+        assert "no new plan" in world.bench.statuses[-1].message
 
 
 def test_silence_is_said(files: dict[str, str]) -> None:
