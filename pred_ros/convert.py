@@ -14,9 +14,24 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header, UInt8MultiArray
 
-from pred_core.bag.clouds import STATE_LAYOUT, TRACKER_LAYOUT, PointFrame, cloud_array, read_tracker_points
+from pred_core.bag.clouds import (
+    STATE_LAYOUT,
+    TRACKER_LAYOUT,
+    PointFrame,
+    check_extent,
+    cloud_array,
+    read_tracker_points,
+)
 from pred_core.bag.grippers import PoseFrame, read_gripper_closed, read_gripper_pose
-from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS, WORLD, check_frame, stamp_of
+from pred_core.bag.wire import (
+    GRIPPER_CLOSED,
+    GRIPPER_POSE,
+    PREDICTION_POINTS,
+    TRACKER_POINTS,
+    WORLD,
+    check_frame,
+    stamp_of,
+)
 from pred_core.errors import InputError
 from pred_core.types import State
 
@@ -79,7 +94,8 @@ def state_to_cloud(stamp: int, ids: NDArray[np.uint32], state: State) -> PointCl
 def cloud_to_state(cloud: PointCloud2, topic: str) -> tuple[int, NDArray[np.uint32], State]:
     """Stamp [ns], particle ids (N,) and `State` (without memory) of state/points or prediction/points.
 
-    Raises: BagError for another frame or layout; InputError if a value is not finite.
+    Raises: BagError for another frame or layout, or a state whose extent only millimetres explain (a prediction may
+    go astray that far: it is scored as it is); InputError if a value is not finite.
     """
     check_frame(cloud, topic)
     table = cloud_array(cloud, STATE_LAYOUT, topic)
@@ -89,6 +105,8 @@ def cloud_to_state(cloud: PointCloud2, topic: str) -> tuple[int, NDArray[np.uint
     if bad.any():
         ids = table["id"][bad][:5].tolist()
         raise InputError(f"{topic}: points of ids {ids} are not finite", allowed="finite metres")
+    if topic != PREDICTION_POINTS:
+        check_extent(position.astype(np.float64), topic)
     held = torch.from_numpy(table["held"].astype(np.int32))
     state = State(torch.from_numpy(position), torch.from_numpy(velocity), held)
     return stamp_of(cloud), table["id"].astype(np.uint32), state

@@ -2,14 +2,14 @@
 
 In: state/points, gripper/pose, goal/points (latched). Out: plan/trajectory, ~/markers of sampled motions if asked for.
 It replans with every new state there is time for. `~/enable` (SetBool) starts and ends planning; `~/stop` (Trigger)
-sends a motion that comes to rest at once and latches; `~/reset` (Trigger) clears the latch and forgets old plans.
+sends a motion that comes to rest at once and latches; `~/reset` (Trigger) clears the latch and forgets old plans, and
+how many grippers there were.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, fields
@@ -24,25 +24,24 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from pred_core.bag.align import slerp
-from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GOAL_POINTS, GRIPPER_POSE, PLAN_TRAJECTORY, STATE_POINTS
 from pred_core.config import setting
 from pred_core.dynamics import Dynamics
-from pred_core.errors import ConfigError, InputError, PredError, TwinError
+from pred_core.errors import ConfigError, PredError, TwinError
+from pred_core.plan.gripper_poses import GripperPoses
 from pred_core.plan.latency import Observation
-from pred_core.plan.plan import NS, Plan
+from pred_core.plan.plan import Plan
 from pred_core.plan.planner import Planner
 from pred_core.plan.rollouts import Rollouts
 from pred_core.plan.session import Session, Timing
 from pred_core.plan.task import load_settings, make_planner, planning_dynamics, scene_with_slot, with_gap
+from pred_core.springmass.device import check_device
 from pred_core.twin import Twin
 from pred_core.types import Array, Scene
 from pred_ros import convert, planner_messages, qos, shell
 from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.shell import Shell
 
-KEPT_POSES = 2.0  # [s] of gripper poses, to find the one at a state's stamp
 SAMPLES_SHOWN = 64  # motions in the markers
 
 
@@ -77,7 +76,7 @@ class PlannerNode(Shell):
         self._changed = threading.Condition()
         self._state: tuple[int, PointCloud2] | None = None  # arrival number, newest state
         self._goal: PointCloud2 | None = None
-        self._poses: deque[PoseFrame] = deque()
+        self._poses = GripperPoses()
         self._ending = self._enabled = self._latched = self._stop_asked = self._reset_asked = False
 
     def setup(self) -> None:
@@ -87,6 +86,7 @@ class PlannerNode(Shell):
             raise TwinError(
                 "parameter 'twin' is empty", next_step="ros2 run pred_ros planner --ros-args -p twin:=FOLDER"
             )
+        check_device(config.device, "parameter 'device'")
         torch.set_num_threads(config.threads)
         self._twin = Twin.load(Path(config.twin))
         settings = load_settings(config.settings)
@@ -158,6 +158,10 @@ class PlannerNode(Shell):
             self.report(OK, "ready; call ~/enable to plan")
         elif self._session.reached:
             self.report(OK, f"goal reached: {1e3 * (self._session.distance or 0.0):.1f} mm")
+        elif not self._session.has_goal:
+            self.report(WARN, f"no usable goal; publish another one on {GOAL_POINTS}")
+        elif self.diagnostics.level == ERROR:  # it is over, and nothing new was planned
+            self.report(WARN, "enabled; no new plan")
 
     def _now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
@@ -183,11 +187,7 @@ class PlannerNode(Shell):
     def _add_pose(self, message: PoseArray) -> None:
         pose = convert.message_to_pose(message)
         with self._changed:
-            if self._poses and pose.stamp < self._poses[-1].stamp:  # a new run, or a clock set back
-                self._poses.clear()
-            self._poses.append(pose)
-            while pose.stamp - self._poses[0].stamp > KEPT_POSES * NS:
-                self._poses.popleft()
+            self._poses.add(pose)
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if request.data and self._latched:
@@ -203,6 +203,8 @@ class PlannerNode(Shell):
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        with self._changed:
+            self._poses.clear()
         self._wake(_latched=False, _reset_asked=True)
         response.success, response.message = True, "old plans forgotten; ~/enable plans again"
         return response
@@ -255,31 +257,11 @@ class PlannerNode(Shell):
             raise TwinError("the particle ids of state/points do not match the twin", got=f"{len(ids)} ids",
                             allowed=f"{len(self._twin.body.id)} ids",
                             next_step="Give predictor and planner the same twin")  # fmt: skip
-        position, rotation = self._pose_at(stamp)
+        with self._changed:
+            position, rotation = self._poses.at(stamp, self.config.pose_gap)
         seen = Observation(stamp, state, position, rotation)
         seen.check(self._twin.body.count)
         return seen
-
-    def _pose_at(self, stamp: int) -> tuple[Array, Array]:
-        with self._changed:
-            poses = list(self._poses)
-        before = next((p for p in reversed(poses) if p.stamp <= stamp), None)
-        after = next((p for p in poses if p.stamp >= stamp), None)
-        if before is not None and after is not None and after.stamp > before.stamp:
-            share = (stamp - before.stamp) / (after.stamp - before.stamp)
-            gap = max(stamp - before.stamp, after.stamp - stamp) / NS
-            position = before.position + share * (after.position - before.position)
-            rotation = slerp(before.rotation, after.rotation, np.full(len(position), share))
-        else:
-            nearest = before or after
-            gap = float("inf") if nearest is None else abs(nearest.stamp - stamp) / NS
-            position, rotation = (nearest.position, nearest.rotation) if nearest else (np.zeros((0, 3)),) * 2
-        if gap > self.config.pose_gap:
-            raise InputError(
-                f"no {GRIPPER_POSE} at the stamp of {STATE_POINTS}", got=f"{gap:.3f} s away",
-                allowed=f"{self.config.pose_gap:g} s", next_step="Check that the arm publishes and clocks agree",
-            )  # fmt: skip
-        return position, rotation
 
     def _replan(self, seen: Observation) -> None:
         self._ways, self._costs = [], []

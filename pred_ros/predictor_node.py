@@ -26,6 +26,7 @@ from std_srvs.srv import Trigger
 from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, PREDICTION_POINTS, STATE_POINTS, TRACKER_POINTS
+from pred_core.cli.settings import parse_held
 from pred_core.config import setting, to_mapping
 from pred_core.dynamics import Dynamics
 from pred_core.errors import ConfigError, DivergenceError, PredError, TwinError
@@ -69,21 +70,14 @@ class PredictorConfig:
     autostart: bool = setting(True, doc="configure and activate without a lifecycle manager")
 
 
-def parse_held(text: str) -> dict[int, int] | None:
-    """'0:0 11:2' -> {0: 0, 11: 2}; '' -> None. Raises: ConfigError."""
-    try:
-        pairs = [tuple(int(x) for x in item.split(":")) for item in text.replace(",", " ").split()]
-        held = {particle: gripper for particle, gripper in pairs}
-    except ValueError as error:
-        raise ConfigError("parameter 'held'", got=repr(text), allowed="pairs like '0:0 1:1 11:2'") from error
-    if any(p < 0 or g < 0 for p, g in held.items()):
-        raise ConfigError("parameter 'held'", got=repr(text), allowed="ids and gripper indices of 0 or more")
-    return held or None
+def held_of(config: PredictorConfig) -> dict[int, int] | None:
+    """Particle id -> gripper; None: not told. Raises: ConfigError."""
+    return parse_held(config.held, "parameter 'held'") if config.held.strip() else None
 
 
 def check(config: PredictorConfig) -> None:
     """Raise ConfigError for what does not go together."""
-    parse_held(config.held)
+    held_of(config)
     if config.mode == "estimate" and config.correct != "none":
         raise ConfigError("parameter 'correct'", got=repr(config.correct), allowed="none where mode is estimate")
 
@@ -124,7 +118,7 @@ class PredictorNode(Shell):
         torch.set_num_threads(config.threads)
         self._twin = Twin.load(Path(config.twin))
         self._ids = self._twin.body.id
-        held = parse_held(config.held)
+        held = held_of(config)
         if held is not None and (unknown := sorted(set(held) - set(self._ids.tolist()))):
             raise TwinError("parameter 'held' names particles the twin does not have", got=unknown[:5])
         self._dynamics = type(self).MAKE_DYNAMICS(self._twin)

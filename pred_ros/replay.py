@@ -19,6 +19,7 @@ from pred_core.bag.playlist import find_clips
 from pred_core.bag.wire import TRACKER_POINTS
 from pred_core.cli.main import INTERRUPTED
 from pred_core.errors import ConfigError, PredError
+from pred_core.twin import Twin
 from pred_ros.commands import run_command
 from pred_ros.live import Replay, replay
 from pred_ros.resources import config_folder, sample_dataset, sample_pictures
@@ -60,6 +61,8 @@ def run(args: argparse.Namespace) -> int:
             got=f"{args.settings} for {source.name}",
             allowed="beside --dataset with a bag of pictures, or a data set of such bags",
         )
+    if args.twin is not None:
+        Twin.load(args.twin)  # before data are converted and nodes started
     out = args.out / source.name
     print(f"1. data: {source.name}, {source.origin}: {source.path}", flush=True)
     dataset = prepare_dataset(source, args.out / "datasets" / source.name)

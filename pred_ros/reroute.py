@@ -23,8 +23,8 @@ from pred_core.arm.limits import GuardConfig
 from pred_core.config import from_mapping
 from pred_core.errors import ConfigError
 from pred_core.plan.endpoints import read_cloud
-from pred_core.plan.goal import size_of
-from pred_core.plan.task import load_settings
+from pred_core.plan.goal import check_goal, size_of
+from pred_core.plan.task import load_settings, workspace
 from pred_core.plant.live.slot import SlotConfig
 from pred_core.track.settings import parse_fixtures
 from pred_core.twin import Twin
@@ -55,7 +55,7 @@ def go(args: argparse.Namespace) -> int:
     """Prepare, run, judge, report. Raises: PredError."""
     check_times(args)
     nodes = prepare(args)
-    goal = read_cloud(args.goal) if args.goal else through_slot(SlotConfig(), size_of(Twin.load(args.twin).body))
+    goal = goal_of(args.goal, nodes)
     fault = FAULTS[args.fault] if args.fault else None
     job = Job(nodes, goal, args.out, args.limit, fault, args.fault_at, None if args.no_pictures else "cam0")
     try:
@@ -129,6 +129,18 @@ def prepare(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
         nodes["planner"].setdefault("gap", slot.gap)
     parse_fixtures(nodes["tracker"].setdefault("fixtures", fixtures_of(slot)))
     return nodes
+
+
+def goal_of(file: Path | None, nodes: Mapping[str, Mapping[str, Any]]) -> Array:
+    """The goal (Q, 3) [m] of a file, or through the slot. Raises: InputError for one that the planner would refuse,
+    TwinError for a node's twin that is none: no node is needed to say so.
+    """
+    Twin.load(Path(nodes["predictor"]["twin"]))
+    given = nodes["planner"]
+    twin, settings = Twin.load(Path(given["twin"])), load_settings(given["settings"])
+    goal = read_cloud(file) if file else through_slot(SlotConfig(), size_of(twin.body))
+    check_goal(goal, twin.body, twin.scene, *workspace(settings))
+    return goal
 
 
 def slot_of(plant: Mapping[str, Any]) -> SlotConfig:

@@ -162,7 +162,8 @@ def _curves(record: Record) -> Figure:
         bottom.plot([record.seconds(s) for s, _, _ in record.planning], [t for _, t, _ in record.planning],
                     "-", color=BLUE, label="computing")  # fmt: skip
     bottom.set(ylabel="replan [s on the wall]", xlabel="cell's time since the arm was enabled [s]", ylim=(0, None))
-    bottom.legend(frameon=False, ncols=2)
+    if bottom.lines:  # without any plan there is nothing to explain
+        bottom.legend(frameon=False, ncols=2)
     for axes in (top, middle, bottom):
         _tidy(axes, [record.seconds(s) for s, _ in record.events])
     return figure

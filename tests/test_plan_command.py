@@ -133,8 +133,13 @@ def test_the_command_writes_plan_and_report(
         (["--goal", "goal.png"], "unknown kind of cloud"),
         (["--shift", "0", "0", "0", "--settings", "typo.yaml"], "did you mean 'samples'?"),
         (["--shift", "0", "0", "0", "--held", "x"], "--held"),
+        (["--shift", "0", "0", "0", "--held", "0:0 0:1"], "--held names a particle twice"),
         (["--shift", "0", "0", "0", "--held", "99:0"], "does not have"),
-        (["--shift", "0", "0", "0", "--replans", "0"], "--replans"),
+        (["--shift", "0", "0", "0", "--replans", "0"], "pred: --replans; got 0; allowed: 1 or more."),
+        (["--shift", "0", "0", "0", "--seed", "-1"], "pred: --seed; got -1; allowed: 0 or more."),
+        (["--shift", "0", "0", "0", "--step", "nan"], "pred: --step; got nan; allowed: above 0 s."),
+        (["--shift", "0", "0", "0", "--settle", "61"], "pred: --settle; got 61.0; allowed: 0 to 60 s."),
+        (["--shift", "0", "0", "0", "--device", "cuda"], "pred: --device; got cuda; allowed: cpu. Without"),
         (["--shift", "0", "0", "0", "--step", "1.5"], "followed longer than it is sent"),
         (["--shift", "0", "0", "0", "--settings", "passage.yaml"], "needs a slot"),
     ],
@@ -148,6 +153,7 @@ def test_unusable_input_is_one_line_and_code_2(
     np.save("empty.npy", np.zeros((0, 3)))
     Path("typo.yaml").write_text("search: {sample: 16}\n")
     Path("passage.yaml").write_text("costs: {passage: 1.0}\n")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert main(["plan", "twin", "--out", "out", *arguments]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and words in lines[0]

@@ -24,6 +24,7 @@ from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
 from ros_bench import Bench, bench_of, own_domain
 from std_msgs.msg import String
 
+from pred_core.errors import BagError
 from pred_core.live import marks
 from pred_core.twin import Extension, ResidualWeights, Twin
 from pred_core.types import State
@@ -150,6 +151,14 @@ def test_clouds_survive_the_wire_bit_for_bit() -> None:
     assert np.array_equal(again.position, frame.position.astype(np.float32)) and again.stamp == frame.stamp
 
 
+def test_a_state_in_millimetres_is_refused_and_a_prediction_astray_is_scored() -> None:
+    stamp, state = prediction(5)
+    cloud = convert.state_to_cloud(stamp, IDS, state.replace(position=1e3 * state.position))
+    with pytest.raises(BagError, match="state/points: implausible extent, are these millimetres?"):
+        convert.cloud_to_state(cloud, "state/points")
+    assert torch.equal(convert.cloud_to_state(cloud, "prediction/points")[2].position, 1e3 * state.position)
+
+
 def run_node(node: type[shell.Shell], *parameters: str) -> int:
     """A node's main with parameters NAME:=VALUE."""
     arguments = ["--ros-args"]
@@ -210,6 +219,8 @@ def test_held_that_does_not_fit_the_twin_is_refused(tmp_path: Path, capfd: pytes
     assert "particles the twin does not have; got [77]" in capfd.readouterr().err
     assert run_node(PredictorNode, f"twin:={twin}", "held:='zero'") == 2
     assert "pairs like '0:0 1:1 11:2'" in capfd.readouterr().err
+    assert run_node(PredictorNode, f"twin:={twin}", "held:='0:0 0:1'") == 2
+    assert "parameter 'held' names a particle twice; got '0:0 0:1'" in capfd.readouterr().err
 
 
 def test_parameters_change_all_or_none(bench: Bench) -> None:

@@ -30,7 +30,7 @@ from pred_ros.camera_pairs import CameraPairs
 from pred_ros.processes import Children
 from pred_ros.reroute_faults import FAULTS
 from pred_ros.reroute_record import PlanSeen, Record, Said
-from pred_ros.reroute_report import timeline
+from pred_ros.reroute_report import timeline, write_report
 from pred_ros.reroute_verdict import errors, goal_distances, judge
 from pred_ros.tracker_node import parse_fixtures
 
@@ -117,6 +117,8 @@ def test_a_node_that_fails_ends_the_run_with_its_own_line(tmp_path: Path) -> Non
         (["plant.gap"], "NODE.PARAMETER=VALUE"),
         (["camera.rate=3"], "plant, tracker, predictor, planner, arm"),
         (["--goal", "goal.png"], "unknown kind of cloud"),
+        (["--goal", "goal.npy", "--twin", "nowhere"], "nowhere"),
+        (["predictor.twin=nowhere"], "nowhere"),
         (["--limit", "nan"], "--limit"),
         (["--seed", "-1"], "--seed"),
         (["tracker.fixtures=abc"], "abc"),
@@ -259,6 +261,39 @@ def test_what_a_node_would_refuse_is_told_before_any_has_started(
     first, second = capsys.readouterr().err.splitlines()
     assert first.startswith(f"pred_reroute: {told}") and second.startswith(f"pred_bringup: {told}")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda goal: goal[:, :2], "goal; got an array of shape (70, 2); allowed: (Q, 3)."),
+        (lambda goal: goal[:0], "the goal is empty"),
+        (lambda goal: goal * np.nan, "not finite; got 70 of 70"),
+        (lambda goal: goal + [5.0, 0.0, 0.0], "the goal is out of reach"),
+        (lambda goal: goal * 1e3, "are these millimetres?"),
+    ],
+)
+def test_a_goal_the_planner_would_refuse_is_told_before_any_node_has_started(
+    change: Any, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def forbidden(*_: object) -> None:
+        raise AssertionError("a node was started")
+
+    monkeypatch.setattr(Children, "start", forbidden)
+    np.save(tmp_path / "goal.npy", change(reroute.through_slot(SlotConfig(), 0.7)))
+    assert reroute.main(["--goal", str(tmp_path / "goal.npy"), "--out", str(tmp_path / "out")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("pred_reroute: ") and words in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_without_any_plan_is_reported_without_a_warning(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    goal = reroute.through_slot(SlotConfig(), 0.7)
+    record = Record(SlotConfig(), goal, now=S, begin=S)
+    write_report(record, judge(record, 1.0, 0.25, None), {}, tmp_path)
+    assert (tmp_path / "report.html").is_file() and not [str(w.message) for w in recwarn]
 
 
 def test_success_must_last() -> None:

@@ -41,6 +41,7 @@ MOVE = np.array([0.06, 0.08, 0.05])  # [m]
 IDS = np.arange(COUNT, dtype=np.uint32)
 LINE = np.column_stack((0.05 * np.arange(COUNT), np.zeros((COUNT, 2))))
 FROM_REST = 0.5 * 1.6 * 0.02**2 + 1e-6  # [m] in the first 20 ms, at 1.6 m/s^2
+CELL_ROPE = Path(__file__).parents[1] / "config" / "twins" / "cell_rope"
 SETTINGS = """
 motion: {horizon: 1.0, knots: 5, speed: 0.2}
 search: {samples: 32, chunk: 16, iterations: 4, frames: 4}
@@ -271,6 +272,7 @@ def test_an_unusable_goal_is_refused_and_a_good_one_helps(
         world.goal(goal)
         world.live(lambda: world.bench.says(ERROR, *words), "an error that says why")
         assert not world.plans and world.bench.node.exit_code is None
+        world.live(lambda: world.bench.says(WARN, "no usable goal"), "a warning that stays, once the error is told")
         world.goal(HOME + LINE + MOVE)
         world.live(lambda: world.plans, "a plan to the good goal")
 
@@ -294,6 +296,8 @@ def test_bad_states_are_refused_with_the_reason(files: dict[str, str]) -> None:
         world.see()
         world.see(position=broken)
         world.bench.until(lambda: world.bench.says(ERROR, "ids [2] are not finite"), "NaN is named")
+        world.see(position=1e3 * (HOME + LINE))
+        world.bench.until(lambda: world.bench.says(ERROR, "state/points", "millimetres?"), "the unit is named")
         world.see(stamp=world.now() - 2_000_000_000)
         world.bench.until(lambda: world.bench.says(ERROR, "state is too old"), "age is named")
         world.see(stamp=world.now() + 300_000_000, pose=False)
@@ -303,6 +307,59 @@ def test_bad_states_are_refused_with_the_reason(files: dict[str, str]) -> None:
         world.goal_out.publish(cloud)
         world.bench.until(lambda: world.bench.says(ERROR, "goal/points", "camera"), "the frame is named")
         assert world.bench.node.exit_code is None
+
+
+def test_grippers_that_change_in_number_are_refused_until_reset(files: dict[str, str]) -> None:
+    """2 grippers at t, 3 at t + 20 ms, a state between them: no traceback, and no pose made up out of both."""
+    with world_of(files) as world:
+        world.goal(HOME + LINE + MOVE)
+        stamp = world.now()
+
+        def pose(at: int, count: int) -> None:
+            place = HOME + np.array([[0.0, 0.1, 0.0]]) * np.arange(count)[:, None]
+            frame = PoseFrame(at, place, np.repeat(DOWN, count, axis=0))
+            world.bench.pose_out.publish(convert.pose_to_message(frame))
+
+        world.bench.until(lambda: world.bench.pose_out.get_subscription_count() >= 1, "the node listens")
+        pose(stamp, 2)
+        pose(stamp + 20_000_000, 3)
+        world.bench.until(
+            lambda: world.bench.says(ERROR, "number of grippers changed", "got 3", "2 as before"), "the change is named"
+        )
+        world.see(stamp=stamp + 10_000_000, pose=False)
+        assert world.ask("reset", Trigger, Trigger.Request()).success and world.enable().success
+        world.live(lambda: world.plans, "plans with one gripper, after a reset")
+        assert world.bench.node.exit_code is None
+
+
+def test_a_gripper_far_from_the_object_or_its_workspace_is_not_planned_for(files: dict[str, str]) -> None:
+    with world_of(files, enabled="true") as world:
+        world.goal(HOME + LINE + MOVE)
+        for up, words in ((5.0, "gripper 0 is outside its workspace"), (0.25, "far from what it is said to hold")):
+            line = HOME + LINE
+            world.moved = np.array([0.0, 0.0, up])
+
+            def said(line: np.ndarray = line, words: str = words) -> bool:
+                world.see(position=line)
+                return world.bench.says(ERROR, words)
+
+            world.bench.until(said, "a line that says so")
+        assert not world.plans
+        world.moved = np.zeros(3)
+        world.live(lambda: world.plans, "a plan once it is there")
+
+
+def test_an_error_that_is_over_does_not_stay_the_headline(files: dict[str, str]) -> None:
+    """One pose of another frame while the node has planned and nothing new comes to plan from."""
+    with world_of(files, enabled="true", max_age="60.0", pose_gap="1.0") as world:
+        world.goal(HOME + LINE + MOVE)
+        world.live(lambda: world.plans, "a plan")
+        stranger = convert.pose_to_message(PoseFrame(world.now(), HOME[None], DOWN))
+        stranger.header.frame_id = "base_link"
+        world.bench.pose_out.publish(stranger)
+        world.bench.until(lambda: world.bench.says(ERROR, "refused", "base_link"), "the frame is named")
+        world.bench.until(lambda: world.bench.statuses[-1].level == WARN, "the error is over", 10.0)
+        assert "no new plan" in world.bench.statuses[-1].message
 
 
 def test_silence_is_said(files: dict[str, str]) -> None:
@@ -338,13 +395,15 @@ def test_markers_only_when_asked_for(files: dict[str, str]) -> None:
         ({}, "parameter 'twin' is empty"),
         ({"twin": "/nowhere"}, "not a twin"),
         ({"budgets": 0.1}, "did you mean 'budget'?"),
+        ({"twin": str(CELL_ROPE), "device": "cuda"}, "parameter 'device'; got cuda; allowed: cpu"),
     ],
 )
 def test_a_process_with_bad_parameters_ends_with_one_line(
     tmp_path: Path, parameters: dict[str, Any], words: str
 ) -> None:
+    environment = node_environment(free_domain()) | {"CUDA_VISIBLE_DEVICES": ""}
     done = subprocess.run(
-        node_command("planner", parameters), env=node_environment(free_domain()), capture_output=True, text=True,
+        node_command("planner", parameters), env=environment, capture_output=True, text=True,
         timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 2

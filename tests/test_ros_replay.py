@@ -202,6 +202,20 @@ def test_the_command_line_says_what_is_wrong(tmp_path: Path, capsys: pytest.Capt
         assert "--settings are the tracker's" in capsys.readouterr().err
 
 
+def test_a_twin_that_is_none_is_told_before_anything_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def forbidden(*_: object) -> None:
+        raise AssertionError("a node was started")
+
+    monkeypatch.setattr(Children, "start", forbidden)
+    out = tmp_path / "out"
+    assert main_job.main(["--dataset", str(SAMPLE), "--twin", "nowhere", "--out", str(out)]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("pred_replay: nowhere") and len(said.err.splitlines()) == 1 and not said.out
+    assert not out.exists()
+
+
 def test_the_sample_is_what_it_says() -> None:
     """The equality test above is about 2 x 300 frames of 12 particles."""
     episodes = list(load_dataset(SAMPLE).episodes("test"))

@@ -167,3 +167,13 @@ def test_buffers_of_long_rollouts_are_not_hoarded() -> None:
         sim.rollout(state, nobody(periods))
     assert sum(work.bytes for work, _, _ in sim._workspaces.values()) <= 1 << 28
     assert len(sim._workspaces) <= 8
+
+
+@pytest.mark.parametrize(("name", "said"), [
+    ("cuda", "device; got cuda; allowed: cpu. Without a CUDA device"), ("gpu", "device; got gpu"),
+])  # fmt: skip
+def test_a_device_that_is_not_here_is_refused(name: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever simulates goes through here: plan, train, the planner node."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match=said):
+        SpringMass(line(), BASE, SCENE, device=name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import shlex
 import sys
 from pathlib import Path
@@ -21,6 +22,7 @@ from pred_core.plan.offline import carry_out, settled
 from pred_core.plan.plan import Plan
 from pred_core.plan.report import write_report
 from pred_core.plan.task import load_settings, make_planner, planning_dynamics, scene_with_slot
+from pred_core.springmass.device import check_device
 from pred_core.twin import Twin
 from pred_core.types import Array
 
@@ -51,12 +53,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Plan, carry out in the twin's own simulation, write the report. Raises: PredError for unusable input."""
-    if args.replans < 1 or args.seed < 0 or not args.step > 0.0 or not 0.0 <= args.settle <= 60.0:
-        got = f"{args.replans}, {args.step}, {args.seed}, {args.settle}"
-        allowed = "1 or more, above 0 s, 0 or more, 0 to 60 s"
-        raise ConfigError("--replans, --step, --seed, --settle", got=got, allowed=allowed)
+    for name, good, allowed in (
+        ("replans", args.replans >= 1, "1 or more"),
+        ("step", 0.0 < args.step < math.inf, "above 0 s"),
+        ("seed", args.seed >= 0, "0 or more"),
+        ("settle", 0.0 <= args.settle <= 60.0, "0 to 60 s"),
+    ):
+        if not good:
+            raise ConfigError(f"--{name}", got=getattr(args, name), allowed=allowed)
     if args.goal is None and args.shift is None:
         raise InputError("no goal was given", next_step="Give --goal CLOUD or --shift DX DY DZ")
+    check_device(args.device, "--device")
     twin = Twin.load(args.twin)
     seen = _start(args, twin)
     config = _settings(args, seen)

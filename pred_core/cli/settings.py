@@ -46,15 +46,17 @@ def given_settings(args: argparse.Namespace, config: type) -> list[str]:
     return flags
 
 
-def parse_held(text: str) -> dict[int, int]:
-    """'0:0 11:1' -> {0: 0, 11: 1}. Raises: ConfigError."""
+def parse_held(text: str, where: str = "--held") -> dict[int, int]:
+    """'0:0 11:1' -> {0: 0, 11: 1}. `where`: what the user set. Raises: ConfigError."""
     try:
         pairs = [tuple(int(x) for x in item.split(":")) for item in text.replace(",", " ").split()]
         held = {particle: gripper for particle, gripper in pairs}
     except ValueError as error:
-        raise ConfigError("--held", got=repr(text), allowed="pairs like '0:0 1:0'") from error
+        raise ConfigError(where, got=repr(text), allowed="pairs like '0:0 1:1 11:2'") from error
     if not held or any(p < 0 or g < 0 for p, g in held.items()):
-        raise ConfigError("--held", got=repr(text), allowed="ids and gripper indices of 0 or more")
+        raise ConfigError(where, got=repr(text), allowed="ids and gripper indices of 0 or more")
+    if len(held) < len(pairs):
+        raise ConfigError(f"{where} names a particle twice", got=repr(text), allowed="each particle in one gripper")
     return held
 
 

@@ -14,8 +14,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar, get_type_hints
 
-import torch
-
 from pred_core.bag.dataset import Dataset, load_dataset
 from pred_core.cli.checks import warn_of_another_object
 from pred_core.cli.network_guard import question_or_say
@@ -23,6 +21,7 @@ from pred_core.config import from_mapping
 from pred_core.errors import ConfigError
 from pred_core.pred import load_base
 from pred_core.residual import ResidualConfig
+from pred_core.springmass.device import check_device
 from pred_core.train import Trainer, TrainingConfig, align
 from pred_core.train.checkpoint import load_checkpoint, read_facts
 from pred_core.train.outliers import leave_out
@@ -60,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     """Train, write the twin and the report. Returns 0, or 130 after an interrupt (a checkpoint is left)."""
     out: Path = args.out or args.twin
     checkpoint = out / CHECKPOINT
-    _check_device(args.device)
+    check_device(args.device, "--device")
     facts = _facts_to_resume(checkpoint, args.resume, args.restart)
     training = _config(TrainingConfig, args, facts["training"] if facts else {})
     network = _config(ResidualConfig, args, facts["network"] if facts else {})
@@ -109,13 +108,6 @@ def build_trainer(
     trainer = Trainer(base, twin.body, kept, training, network, twin.scene.gravity, device)
     trainer.left_out = left_out
     return trainer
-
-
-def _check_device(name: str) -> None:
-    here = ["cpu", "cuda", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
-    here = here if torch.cuda.is_available() else ["cpu"]
-    if name not in here:
-        raise ConfigError("--device", got=name, allowed=", ".join(here))
 
 
 def _facts_to_resume(checkpoint: Path, resume: bool, restart: bool) -> dict[str, Any] | None:

@@ -18,6 +18,7 @@ from pred_core.estimate.grasped import Levers, placed_in_gripper
 from pred_core.estimate.measurement import Measurement, Outcome
 from pred_core.estimate.starter import Start
 from pred_core.live.condition import Condition
+from pred_core.live.holding import held_at_start
 from pred_core.live.laps import Time
 from pred_core.live.prediction_records import Pose, Prediction, Rules
 from pred_core.live.run import Run
@@ -128,10 +129,11 @@ class Follower(Run):
         return True
 
     def _begin_with(self, time: Time, found: Start, grip: Grip) -> None:
+        held = held_at_start(self._ids, self._held, found.position, grip, grip)
         state = State(
             position=torch.as_tensor(found.position, dtype=torch.float32),
             velocity=torch.as_tensor(found.velocity, dtype=torch.float32),
-            held=torch.as_tensor(self._held_by(found.position, grip), dtype=torch.int32),
+            held=torch.as_tensor(held, dtype=torch.int32),
         )
         self._estimator.start(time[1], placed_in_gripper(state, grip, self._levers), grip)
         self._state, self._time, self._found = self._estimator.state, time, None

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from pred_core.bag.clouds import PointFrame
+from pred_core.live.holding import held_at_start
 from pred_core.live.laps import Time
 from pred_core.live.prediction_records import Pose, Prediction
 from pred_core.live.run import ON_GRID, Run
@@ -74,10 +75,11 @@ class Predictor(Run):
         earlier = np.argsort(first.id)[np.searchsorted(np.sort(first.id), self._ids)]
         now, before = second.position[order], first.position[earlier]
         dt = (second.stamp - first.stamp) * 1e-9
+        held = held_at_start(self._ids, self._held, before, self._grip_near(first.stamp, grip), grip)
         state = State(
             position=torch.as_tensor(now, dtype=torch.float32),
             velocity=torch.as_tensor((now - before) / dt, dtype=torch.float32),
-            held=torch.as_tensor(self._held_by(before, self._grip_near(first.stamp, grip)), dtype=torch.int32),
+            held=torch.as_tensor(held, dtype=torch.int32),
         )
         self._state = self._dynamics.start(state, grip)
         self._time = time

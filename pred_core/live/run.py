@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from pred_core.bag.align import slerp
 from pred_core.bag.clouds import PointFrame
-from pred_core.bag.episode import GRASP_RADIUS
 from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
 from pred_core.calibration import Calibration
@@ -265,18 +264,6 @@ class Run:
             moved = Grip(grip.position + velocity * (k * self._dynamics.period), grip.rotation, grip.closed)
             ahead = self._stepped(ahead, moved, stamp + k * self._period)
         return Prediction(stamp, state, stamp + count * self._period, ahead)
-
-    def _held_by(self, position: NDArray[np.float64], grip: Grip) -> NDArray[np.int32]:
-        held = np.full(len(self._ids), -1, np.int32)
-        if self._held is not None:
-            for particle, gripper in self._held.items():
-                held[self._ids == particle] = gripper
-            return held
-        distance = np.linalg.norm(position[:, None] - grip.position.double().numpy()[None], axis=-1)
-        distance[:, ~grip.closed.numpy()] = np.inf
-        near = distance.min(axis=1) <= GRASP_RADIUS
-        held[near] = distance.argmin(axis=1)[near]
-        return held
 
     def _between(self, a: Pose, b: Pose, stamp: int) -> Grip:
         weight = (stamp - a.pose.stamp) / (b.pose.stamp - a.pose.stamp)

@@ -91,8 +91,15 @@ def departure(dynamics: Dynamics, seen: Observation, begin: int, in_force: Plan 
 
 
 def tracking_error(seen: Observation, in_force: Plan | Course) -> float:
-    """[m] how far the farthest gripper is from where what is in force has it at the observation's time."""
-    return float(np.linalg.norm(seen.position - in_force.at(seen.stamp).position, axis=-1).max())
+    """[m] how far the farthest gripper is from where what is in force has it at the observation's time.
+
+    Raises: InputError if that is for another number of grippers.
+    """
+    told = in_force.at(seen.stamp).position
+    if told.shape != seen.position.shape:
+        raise InputError("the plans in force are for other grippers", got=len(seen.position), allowed=len(told),
+                         next_step="Call ~/reset; then it plans for those that are there")  # fmt: skip
+    return float(np.linalg.norm(seen.position - told, axis=-1).max())
 
 
 def _grip(position: Array, rotation: Array, closed: torch.Tensor) -> Grip:

@@ -16,6 +16,7 @@ from pred_core.plan.goal_cost import GoalCost
 from pred_core.plan.latency import Observation, tracking_error
 from pred_core.plan.plan import NS, Plan
 from pred_core.plan.planner import Planner
+from pred_core.plan.start import check_start
 from pred_core.types import Array
 
 STILL = 1e-3  # [m] grippers that stay within this
@@ -105,7 +106,8 @@ class Session:
         first, it begins at the measured pose at rest. None: goal reached, the arm must rest first, plan too late, or
         the first, slow run.
 
-        Raises: InputError for no goal, a bad or old observation, or an unsafe plan; DivergenceError.
+        Raises: InputError for no goal, a bad or old observation, a start out of reach (start.py), or an unsafe plan;
+        DivergenceError.
         """
         if self._planner is None:
             raise InputError("there is no goal", next_step="Publish goal/points")
@@ -118,6 +120,7 @@ class Session:
         if self.reached:
             return None
         self._check_arm(seen)
+        check_start(seen, self._planner.config.motion)
         if self._must_rest:
             self.counts.moving += 1
             return None

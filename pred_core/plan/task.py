@@ -50,13 +50,19 @@ def planning_dynamics(twin: Twin, scene: Scene, device: str = "cpu") -> Dynamics
     return with_residual(base, twin, device)
 
 
+def workspace(config: PlannerConfig) -> tuple[Array, Array]:
+    """Corners (3,), (3,) [m] world of the box that grippers stay in."""
+    m = config.motion
+    return np.array([m.x_low, m.y_low, m.z_low]), np.array([m.x_high, m.y_high, m.z_high])
+
+
 def make_objective(body: Body, scene: Scene, goal: Array, config: PlannerConfig) -> Objective:
     """Every cost whose weight is not 0. `scene`: with its slot. goal (Q, 3) [m] world.
 
     Raises: InputError for an unusable goal (goal.py); ConfigError for a cost of the slot without one.
     """
-    c, m = config.costs, config.motion
-    low, high = np.array([m.x_low, m.y_low, m.z_low]), np.array([m.x_high, m.y_high, m.z_high])
+    c = config.costs
+    low, high = workspace(config)
     points = check_goal(goal, body, scene, low, high)
     seen = None if bool(body.surface.all()) else np.flatnonzero(body.surface).astype(np.int64)
     costs: list[Cost] = []

@@ -14,6 +14,7 @@ from pred_core.errors import ConfigError, DivergenceError, InputError
 from pred_core.springmass import grasp, kernel
 from pred_core.springmass.arrays import ModelArrays, chains, line_ends, mass_of_worlds
 from pred_core.springmass.collision import candidate_pairs, connected_within
+from pred_core.springmass.device import check_device
 from pred_core.springmass.lanes import pack, pack_into, unpack
 from pred_core.springmass.parameters import added_by, effects_of, extensions_per_world, parameter_rows
 from pred_core.springmass.stability import choose_substeps
@@ -33,7 +34,8 @@ class SpringMass:
     the state must then have W worlds. `spring_mask` (W, S) switches springs per world. Float32 on `device`.
     Buffers are kept between calls: one thread uses one instance.
 
-    Raises: ConfigError if the worlds' extensions are different effects or a count does not match.
+    Raises: ConfigError if the device is not here, the worlds' extensions are different effects, or a count does not
+    match.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class SpringMass:
         diverged_as_nan: bool = False,
         staged: bool | None = None,
     ):
+        check_device(device)
         self.body, self.scene, self.period, self.device = body, scene, period, device
         self.physics = [physics] if isinstance(physics, Physics) else list(physics)
         per_world = extensions_per_world(extensions, len(self.physics))
