@@ -66,16 +66,18 @@ class Rig:
         pose = Pose(position=Point(x=px, y=py, z=pz), orientation=Quaternion(w=w, x=x, y=y, z=z))
         self.pose[name].publish(PoseStamped(header=convert.header_at(START, world), pose=pose))
 
-    def show(self, frame: CameraFrame, name: str, depth_frame: str = "") -> None:
-        """Publish a picture."""
+    def show(self, frame: CameraFrame, name: str, depth_frame: str = "", depth_off: int | None = 0) -> None:
+        """Publish a picture; `depth_off` [ns]: of the depth's stamp from the colour's, None: no depth."""
         height, width = frame.depth.shape
         optical = images.optical_frame(name)
         color = Image(header=convert.header_at(frame.stamp, optical), height=height, width=width, encoding="rgb8")
         color.step, color.data = 3 * width, array("B", frame.rgb.tobytes())
-        depth = Image(header=convert.header_at(frame.stamp, depth_frame or optical), height=height, width=width)
-        depth.encoding, depth.step, depth.data = "32FC1", 4 * width, array("B", frame.depth.tobytes())
         self.color[name].publish(color)
-        self.depth[name].publish(depth)
+        if depth_off is not None:
+            header = convert.header_at(frame.stamp + depth_off, depth_frame or optical)
+            depth = Image(header=header, height=height, width=width, encoding="32FC1", step=4 * width)
+            depth.data = array("B", frame.depth.tobytes())
+            self.depth[name].publish(depth)
 
     def shown(self, frame: CameraFrame, name: str) -> bool:
         """Publish a picture; whether the node says that it waits for the gripper."""
@@ -179,6 +181,38 @@ def test_a_gripper_that_is_there_is_waited_for(rig: Rig, monkeypatch: pytest.Mon
 def test_one_dead_camera_is_named_and_the_other_goes_on(rig: Rig) -> None:
     rig.until_found()
     rig.show_until(lambda: rig.bench.says(WARN, "tracking without cam1"), ("cam0",))
+
+
+@pytest.mark.parametrize(
+    ("depth_off", "said"), [(None, "colour without depth"), (5_000_000, "stamps of colour and depth differ by 5 ms")]
+)
+def test_pictures_without_a_partner_are_not_tracking(rig: Rig, depth_off: int | None, said: str) -> None:
+    rig.until_found()
+    count, stamp = len(rig.frames), rig.frames[-1].stamp
+    frames, pause = rig.scene.frames(stamp), 0.05  # [s]
+
+    def shown() -> bool:
+        nonlocal stamp
+        stamp += STEP
+        for name, frame in frames.items():
+            rig.show(dataclasses.replace(frame, stamp=stamp), name, depth_off=depth_off)
+        end = time.monotonic() + pause
+        while time.monotonic() < end:
+            rig.bench.executor.spin_once(timeout_sec=0.01)
+        return rig.bench.says(ERROR, "nothing is tracked", "cam0, cam1", said)
+
+    rig.bench.until(shown, "an error that says why", limit=10.0)
+    assert rig.bench.node.diagnostics.level == ERROR and len(rig.frames) <= count + 2, "a last picture may be under way"
+    rig.show_until(lambda: rig.bench.node.diagnostics.level == OK, NAMES)
+
+
+def test_particles_that_are_not_of_now_are_not_tracking(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever keeps the worker from publishing: the line is of what was published, not of what was meant to be."""
+    rig.until_found()
+    monkeypatch.setattr(tracker_node, "OLD", -1.0)
+    rig.bench.node._heartbeat()
+    assert rig.bench.node.diagnostics.level == WARN
+    assert "the newest particles are 0.0 s old" in rig.bench.node.diagnostics.message
 
 
 def test_camera_pose_in_another_frame_is_refused(rig: Rig) -> None:
