@@ -78,8 +78,10 @@ class CameraPairs:
             self._inboxes[name].camera.add_pose(message)
 
     def take(self, patience: float) -> dict[str, tuple[Any, Any]]:
-        """Wait for pairs: of every camera heard of lately, or what has come `patience` [s] after the first. Nothing where
-        none comes within IDLE: whoever waits has other things to do."""
+        """Wait for pairs: of every camera heard of lately, or what has come `patience` [s] after the first.
+
+        Nothing where none comes within IDLE: whoever waits has other things to do.
+        """
         with self._wake:
             idle = time.monotonic() + IDLE
             while self._open and not self._ready():

@@ -153,7 +153,7 @@ class TrackerNode(Shell):
             return WARN, f"{self._status}: the object is not in view, or is not a {self.config.kind}"
         age = self.diagnostics.age(NEWEST)
         if age is None or not 0.0 <= age <= OLD:
-            return WARN, f"the newest particles are {age or 0.0:.1f} s old though pictures come: the tracker is too slow"
+            return WARN, f"the newest particles are {age or 0.0:.1f} s old though pictures come: it is too slow for them"
         gap_age = self.diagnostics.age("last gap")
         if gap_age is not None and gap_age < REFUSAL_SHOWN:
             return WARN, self._gap
