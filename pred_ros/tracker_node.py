@@ -41,6 +41,7 @@ SILENT = 1.0  # [s] without a complete picture before a camera counts as dead
 OLD = 2.0  # [s] since the newest particles before they are not of now, whatever the pictures do
 WAITING = "waiting"
 NEWEST = "newest particles"
+NEWS = 1000  # gripper poses and priors that wait for a busy worker, the newest: more than 2 s, which is all it keeps
 GAP, GAP_TIMES = 0.25, 2.5  # [s], usual times between pictures: a longer silence of all cameras is said afterwards
 
 
@@ -68,7 +69,8 @@ class TrackerNode(Shell):
         self._gripped = False  # the tracker has a gripper's pose and knows whether it is closed
         self._first: float | None = None  # [s] of the first pictures
         self._lock = threading.Lock()  # guards what callbacks hand to the worker
-        self._news: list[Callable[[Tracker], None]] = []
+        self._news: deque[Callable[[Tracker], None]] = deque(maxlen=NEWS)
+        self._anew = False  # somebody has asked for a search
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
         self._status = "searching"
         self._odd: tuple[str, float] | None = None
@@ -153,7 +155,7 @@ class TrackerNode(Shell):
             return WARN, f"{self._status}: the object is not in view, or is not a {self.config.kind}"
         age = self.diagnostics.age(NEWEST)
         if age is None or not 0.0 <= age <= OLD:
-            return WARN, f"the newest particles are {age or 0.0:.1f} s old though pictures come: it is too slow for them"
+            return WARN, f"the newest particles are {age or 0.0:.1f} s old though pictures come: too slow for them?"
         gap_age = self.diagnostics.age("last gap")
         if gap_age is not None and gap_age < REFUSAL_SHOWN:
             return WARN, self._gap
@@ -198,7 +200,7 @@ class TrackerNode(Shell):
         self._tell(lambda tracker: tracker.set_prior(prior))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._tell(lambda tracker: tracker.reset())
+        self._anew = True
         response.success, response.message = True, "searching in the next pictures"
         return response
 
@@ -211,13 +213,7 @@ class TrackerNode(Shell):
     def _work(self) -> None:
         while not self._stopping:
             pairs = self._pairs.take(self.config.patience)
-            with self._lock:
-                news, self._news = self._news, []
-            try:
-                for action in news:
-                    action(self._tracker)
-            except PredError as error:
-                self.refuse(error)
+            self._hear()
             if not pairs:
                 continue
             waits = self._waits()
@@ -235,6 +231,21 @@ class TrackerNode(Shell):
             if estimate is not None:
                 self._publish(estimate)
             self._status = "searching" if estimate is None else estimate.status
+
+    def _hear(self) -> None:
+        """Do what came between the pictures; what cannot be used is refused, and the rest goes on."""
+        if self._anew:
+            self._anew = False
+            self._tracker.reset()
+            self._status = "searching"
+        with self._lock:
+            news = list(self._news)
+            self._news.clear()
+        for action in news:
+            try:
+                action(self._tracker)
+            except PredError as error:
+                self.refuse(error)
 
     def _add_grip(self, tracker: Tracker, pose: PoseFrame, closed: NDArray[np.bool_]) -> None:
         tracker.add_grip(pose.stamp, pose.position, pose.rotation, closed)

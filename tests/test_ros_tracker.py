@@ -21,6 +21,7 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from rclpy.qos import qos_profile_sensor_data
 from ros_bench import Bench, bench_of, own_domain
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_srvs.srv import Trigger
 from track_scenes import LENGTH, STEP, TURN, HangingRope
 
 from pred_core.bag import images
@@ -36,6 +37,7 @@ from pred_ros.tracker_node import TrackerNode
 ERROR, WARN, OK = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
 START = 5_000_000_000  # [ns]
 NAMES = ("cam0", "cam1")
+CLOSED = np.array([True])
 PARAMETERS = {"cameras": "cam0 cam1", "particles": "26", "patience": "0.2"}
 
 
@@ -181,6 +183,38 @@ def test_a_gripper_that_is_there_is_waited_for(rig: Rig, monkeypatch: pytest.Mon
 def test_one_dead_camera_is_named_and_the_other_goes_on(rig: Rig) -> None:
     rig.until_found()
     rig.show_until(lambda: rig.bench.says(WARN, "tracking without cam1"), ("cam0",))
+
+
+def test_what_comes_without_pictures_is_heard_and_does_not_pile_up(rig: Rig) -> None:
+    node, sent = rig.bench.node, 0
+
+    def heard() -> bool:
+        nonlocal sent
+        sent += 1
+        rig.hold(START + sent * STEP)
+        return node.diagnostics.counter(f"messages on {GRIPPER_POSE}") > 10 and not node._news
+
+    rig.close()
+    rig.bench.until(heard, "poses that reached the tracker, without a picture", limit=10.0)
+
+
+def test_one_refused_message_takes_nothing_else_with_it(rig: Rig) -> None:
+    """A pose the tracker refuses, then a good one and a search: both are done. What waits is bounded."""
+    rig.until_found()
+    node: Any = rig.bench.node
+    with node._lock:  # the worker finds all of it at once
+        bad = functools.partial(node._add_grip, pose=PoseFrame(START, np.full((1, 3), np.nan), TURN), closed=CLOSED)
+        good = functools.partial(
+            node._add_grip, pose=PoseFrame(9 * START, rig.scene.gripper[None], TURN), closed=CLOSED
+        )
+        node._news.extend([bad, good])
+        answer = node._on_reset(Trigger.Request(), Trigger.Response())
+    rig.bench.until(lambda: rig.bench.says(ERROR, "gripper pose is not finite"), "the refusal")
+    rig.bench.until(lambda: node._tracker._path.at(9 * START) is not None, "the pose after it")
+    assert answer.success and node._tracker.searching
+    with node._lock:  # a worker that is busy for long
+        node._news.extend([good] * (tracker_node.NEWS + 1))
+        assert len(node._news) == tracker_node.NEWS
 
 
 @pytest.mark.parametrize(
