@@ -41,6 +41,7 @@ SILENT = 1.0  # [s] without a complete picture before a camera counts as dead
 OLD = 2.0  # [s] since the newest particles before they are not of now, whatever the pictures do
 WAITING = "waiting"
 NEWEST = "newest particles"
+SURE = 0.5  # confidence that only a particle in view exceeds
 NEWS = 1000  # gripper poses and priors that wait for a busy worker, the newest: more than 2 s, which is all it keeps
 GAP, GAP_TIMES = 0.25, 2.5  # [s], usual times between pictures: a longer silence of all cameras is said afterwards
 
@@ -73,6 +74,7 @@ class TrackerNode(Shell):
         self._anew = False  # somebody has asked for a search
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
         self._status = "searching"
+        self._surest = 0.0  # confidence of the surest of the newest particles
         self._odd: tuple[str, float] | None = None
         self._slipped = False
         self._gap = ""
@@ -156,6 +158,8 @@ class TrackerNode(Shell):
         age = self.diagnostics.age(NEWEST)
         if age is None or not 0.0 <= age <= OLD:
             return WARN, f"the newest particles are {age or 0.0:.1f} s old though pictures come: too slow for them?"
+        if self._surest <= SURE:
+            return WARN, f"tracking, but no particle's confidence is above {SURE:g}: is the object in view?"
         gap_age = self.diagnostics.age("last gap")
         if gap_age is not None and gap_age < REFUSAL_SHOWN:
             return WARN, self._gap
@@ -268,6 +272,7 @@ class TrackerNode(Shell):
         frame = PointFrame(int(t.stamp), t.position, t.id, t.confidence, None)
         self._out.publish(convert.points_to_cloud(frame))
         self.diagnostics.seen(NEWEST)
+        self._surest = float(t.confidence.max(initial=0.0))
         self._odd, self._slipped = estimate.odd_camera(), estimate.slipped
         self.diagnostics.count("estimates")
         self.diagnostics.value("residual [mm]", f"{1e3 * estimate.residual:.2f}")

@@ -270,6 +270,21 @@ def test_depth_that_is_all_nan_is_named_and_the_run_goes_on(rig: Rig) -> None:
     rig.bench.until(lambda: len(rig.frames) > count, "particles again")
 
 
+def test_depth_in_millimetres_said_to_be_metres_is_named(rig: Rig) -> None:
+    rig.until_found()
+    frame = rig.scene.frames(rig.frames[-1].stamp + STEP)["cam0"]
+    rig.show(dataclasses.replace(frame, depth=1000.0 * frame.depth), "cam0")
+    rig.bench.until(lambda: rig.bench.says(ERROR, "cam0", "are these millimetres?"), "an error that names the unit")
+
+
+def test_particles_that_nobody_sees_are_not_reported_as_fine(rig: Rig) -> None:
+    rig.until_found()
+    rig.show_until(lambda: rig.bench.says(OK, "tracking"), NAMES)
+    rig.scene.move(np.array([3.0, 0.0, 0.0]))  # out of every picture
+    rig.show_until(lambda: rig.bench.says(WARN, "no particle's confidence is above 0.5"), NAMES)
+    assert rig.frames[-1].confidence.max() <= 0.5
+
+
 def test_depth_of_another_frame_is_refused(rig: Rig) -> None:
     frame = rig.scene.frames(START)["cam0"]
     for _ in range(20):
