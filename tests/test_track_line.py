@@ -331,4 +331,4 @@ def test_bad_input_is_named(tracker: Tracker, scene: HangingRope) -> None:
             tracker.add_frame("cam0", dataclasses.replace(frame, **change))
     far = frame.depth.copy()
     far[:80] = 500.0
-    tracker.add_frame("cam0", dataclasses.replace(frame, depth=far))  # what is wrong in a third of the rows is not the unit
+    tracker.add_frame("cam0", dataclasses.replace(frame, depth=far))  # wrong in a third of the rows: not the unit
