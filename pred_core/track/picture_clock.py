@@ -37,7 +37,7 @@ class PictureClock:
                 f"{camera}: a picture {abs(leap) * 1e-9:.1f} s {'ahead of' if leap > 0 else 'behind'} {rest}",
                 got=f"stamp {stamp * 1e-9:.3f} s",
                 allowed=f"within {LEAP * 1e-9:g} s of {self._newest * 1e-9:.3f} s",
-                next_step="Not used unless more pictures confirm it; after an outage they do, else check the camera's clock",
+                next_step="Not used unless more confirm it; after an outage they do, else check the camera's clock",
             )
         self._newest = stamp
         self._cameras = {camera}
