@@ -145,7 +145,7 @@ class TrackerNode(Shell):
         self.report(*self._verdict())
 
     def _verdict(self) -> tuple[bytes, str]:
-        """What is wrong, the worst first."""
+        """What is wrong, the worst first; a cause before what follows from it."""
         if self.refusal:
             return ERROR, self.refusal
         silent = {name: self._pairs.why(name) for name in self._pairs.silent(SILENT)}
@@ -158,8 +158,6 @@ class TrackerNode(Shell):
         age = self.diagnostics.age(NEWEST)
         if age is None or not 0.0 <= age <= OLD:
             return WARN, f"the newest particles are {age or 0.0:.1f} s old though pictures come: too slow for them?"
-        if self._surest <= SURE:
-            return WARN, f"tracking, but no particle's confidence is above {SURE:g}: is the object in view?"
         gap_age = self.diagnostics.age("last gap")
         if gap_age is not None and gap_age < REFUSAL_SHOWN:
             return WARN, self._gap
@@ -170,6 +168,8 @@ class TrackerNode(Shell):
             return WARN, f"{camera} sees the object {1e3 * off:.0f} mm off: has it been moved? Calibrate it anew"
         if silent:
             return WARN, f"tracking without {_grouped(silent)}"
+        if self._surest <= SURE:  # after what may be its cause
+            return WARN, f"tracking, but no particle's confidence is above {SURE:g}: is the object in view?"
         return OK, "tracking"
 
     def _listen(self, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any) -> Subscription:
