@@ -33,12 +33,16 @@ from pred_core.track.estimate import Estimate, Prior
 from pred_core.track.settings import TrackerSettings, make_tracker, parse_cameras, parse_fixtures
 from pred_core.track.tracker import HEARD, Tracker
 from pred_ros import convert, qos, shell
-from pred_ros.camera_pairs import CameraPairs
+from pred_ros.camera_pairs import NO_PICTURES, CameraPairs
 from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.shell import REFUSAL_SHOWN, Shell
 
-SILENT = 1.0  # [s] without a picture before a camera counts as dead
+SILENT = 1.0  # [s] without a complete picture before a camera counts as dead
+OLD = 2.0  # [s] since the newest particles before they are not of now, whatever the pictures do
 WAITING = "waiting"
+NEWEST = "newest particles"
+SURE = 0.5  # confidence that only a particle in view exceeds
+NEWS = 1000  # gripper poses and priors that wait for a busy worker, the newest: more than 2 s, which is all it keeps
 GAP, GAP_TIMES = 0.25, 2.5  # [s], usual times between pictures: a longer silence of all cameras is said afterwards
 
 
@@ -66,9 +70,11 @@ class TrackerNode(Shell):
         self._gripped = False  # the tracker has a gripper's pose and knows whether it is closed
         self._first: float | None = None  # [s] of the first pictures
         self._lock = threading.Lock()  # guards what callbacks hand to the worker
-        self._news: list[Callable[[Tracker], None]] = []
+        self._news: deque[Callable[[Tracker], None]] = deque(maxlen=NEWS)
+        self._anew = False  # somebody has asked for a search
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
         self._status = "searching"
+        self._surest = 0.0  # confidence of the surest of the newest particles
         self._odd: tuple[str, float] | None = None
         self._slipped = False
         self._gap = ""
@@ -88,6 +94,7 @@ class TrackerNode(Shell):
         """Subscribe and start the worker."""
         self._pairs = CameraPairs(self._names, self.seconds)
         self._stopping, self._published, self._gripped, self._first = False, -1, False, None
+        self._status = "searching"
         for name in self._names:
             for kind, topic in (("color", images.COLOR), ("depth", images.DEPTH)):
                 callback = functools.partial(self._on_image, name, kind)
@@ -134,27 +141,36 @@ class TrackerNode(Shell):
             return
         self.diagnostics.value("pictures dropped, newer came", str(self._pairs.dropped))
         self.diagnostics.value("pictures that came too late", str(self._tracker.stale))
-        silent = self._pairs.silent(SILENT)
-        gap_age = self.diagnostics.age("last gap")
+        self.diagnostics.value("pictures without their partner", str(self._pairs.unpaired))
+        self.report(*self._verdict())
+
+    def _verdict(self) -> tuple[bytes, str]:
+        """What is wrong, the worst first; a cause before what follows from it."""
         if self.refusal:
-            self.report(ERROR, self.refusal)
-        elif len(silent) == len(self._names):
-            self.report(ERROR, f"no pictures of {', '.join(silent)}: nothing is tracked")
-        elif self._status == WAITING:
-            self.report(WARN, "waiting for the gripper, which says which end of a line is the first")
-        elif self._status != "tracking":
-            self.report(WARN, f"{self._status}: the object is not in view, or is not a {self.config.kind}")
-        elif gap_age is not None and gap_age < REFUSAL_SHOWN:
-            self.report(WARN, self._gap)
-        elif self._slipped:
-            self.report(WARN, "tracking; the object has slipped out of the gripper")
-        elif self._odd is not None:
+            return ERROR, self.refusal
+        silent = {name: self._pairs.why(name) for name in self._pairs.silent(SILENT)}
+        if len(silent) == len(self._names):
+            return ERROR, _nothing(silent)
+        if self._status == WAITING:
+            return WARN, "waiting for the gripper, which says which end of a line is the first"
+        if self._status != "tracking":
+            return WARN, f"{self._status}: the object is not in view, or is not a {self.config.kind}"
+        age = self.diagnostics.age(NEWEST)
+        if age is None or not 0.0 <= age <= OLD:
+            return WARN, f"the newest particles are {age or 0.0:.1f} s old though pictures come: too slow for them?"
+        gap_age = self.diagnostics.age("last gap")
+        if gap_age is not None and gap_age < REFUSAL_SHOWN:
+            return WARN, self._gap
+        if self._slipped:
+            return WARN, "tracking; the object has slipped out of the gripper"
+        if self._odd is not None:
             camera, off = self._odd
-            self.report(WARN, f"{camera} sees the object {1e3 * off:.0f} mm off: has it been moved? Calibrate it anew")
-        elif silent:
-            self.report(WARN, f"tracking without {', '.join(silent)}: no pictures")
-        else:
-            self.report(OK, "tracking")
+            return WARN, f"{camera} sees the object {1e3 * off:.0f} mm off: has it been moved? Calibrate it anew"
+        if silent:
+            return WARN, f"tracking without {_grouped(silent)}"
+        if self._surest <= SURE:  # after what may be its cause
+            return WARN, f"tracking, but no particle's confidence is above {SURE:g}: is the object in view?"
+        return OK, "tracking"
 
     def _listen(self, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any) -> Subscription:
         self._inputs.append(self.create_subscription(kind, topic, callback, profile))
@@ -188,7 +204,7 @@ class TrackerNode(Shell):
         self._tell(lambda tracker: tracker.set_prior(prior))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._tell(lambda tracker: tracker.reset())
+        self._anew = True
         response.success, response.message = True, "searching in the next pictures"
         return response
 
@@ -201,14 +217,10 @@ class TrackerNode(Shell):
     def _work(self) -> None:
         while not self._stopping:
             pairs = self._pairs.take(self.config.patience)
-            with self._lock:
-                news, self._news = self._news, []
-            try:
-                for action in news:
-                    action(self._tracker)
-            except PredError as error:
-                self.refuse(error)
-            waits = bool(pairs) and self._waits()
+            self._hear()
+            if not pairs:
+                continue
+            waits = self._waits()
             for name, pair in pairs.items():
                 try:
                     picture = self._pairs.picture(name, pair)
@@ -220,9 +232,24 @@ class TrackerNode(Shell):
                 self._status = WAITING
                 continue
             estimate = self._tracker.step()
-            self._status = "searching" if estimate is None else estimate.status
             if estimate is not None:
                 self._publish(estimate)
+            self._status = "searching" if estimate is None else estimate.status
+
+    def _hear(self) -> None:
+        """Do what came between the pictures; what cannot be used is refused, and the rest goes on."""
+        if self._anew:
+            self._anew = False
+            self._tracker.reset()
+            self._status = "searching"
+        with self._lock:
+            news = list(self._news)
+            self._news.clear()
+        for action in news:
+            try:
+                action(self._tracker)
+            except PredError as error:
+                self.refuse(error)
 
     def _add_grip(self, tracker: Tracker, pose: PoseFrame, closed: NDArray[np.bool_]) -> None:
         tracker.add_grip(pose.stamp, pose.position, pose.rotation, closed)
@@ -244,6 +271,8 @@ class TrackerNode(Shell):
         self._published = int(t.stamp)
         frame = PointFrame(int(t.stamp), t.position, t.id, t.confidence, None)
         self._out.publish(convert.points_to_cloud(frame))
+        self.diagnostics.seen(NEWEST)
+        self._surest = float(t.confidence.max(initial=0.0))
         self._odd, self._slipped = estimate.odd_camera(), estimate.slipped
         self.diagnostics.count("estimates")
         self.diagnostics.value("residual [mm]", f"{1e3 * estimate.residual:.2f}")
@@ -259,6 +288,21 @@ class TrackerNode(Shell):
                 self.diagnostics.count("gaps")
                 self.report(WARN, self._gap)
             self._spacings.append(spacing)
+
+
+def _nothing(silent: dict[str, str]) -> str:
+    """The line where no camera, of camera -> why, gives a complete picture."""
+    if set(silent.values()) == {NO_PICTURES}:
+        return f"no pictures of {', '.join(silent)}: nothing is tracked"
+    return f"nothing is tracked; {_grouped(silent)}"
+
+
+def _grouped(silent: dict[str, str]) -> str:
+    """'cam0, cam2: no pictures; cam1: ...' of camera -> why."""
+    names: dict[str, list[str]] = {}
+    for name, why in silent.items():
+        names.setdefault(why, []).append(name)
+    return "; ".join(f"{', '.join(group)}: {why}" for why, group in names.items())
 
 
 def main() -> NoReturn:

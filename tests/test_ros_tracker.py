@@ -21,6 +21,7 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from rclpy.qos import qos_profile_sensor_data
 from ros_bench import Bench, bench_of, own_domain
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_srvs.srv import Trigger
 from track_scenes import LENGTH, STEP, TURN, HangingRope
 
 from pred_core.bag import images
@@ -36,6 +37,7 @@ from pred_ros.tracker_node import TrackerNode
 ERROR, WARN, OK = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
 START = 5_000_000_000  # [ns]
 NAMES = ("cam0", "cam1")
+CLOSED = np.array([True])
 PARAMETERS = {"cameras": "cam0 cam1", "particles": "26", "patience": "0.2"}
 
 
@@ -66,16 +68,18 @@ class Rig:
         pose = Pose(position=Point(x=px, y=py, z=pz), orientation=Quaternion(w=w, x=x, y=y, z=z))
         self.pose[name].publish(PoseStamped(header=convert.header_at(START, world), pose=pose))
 
-    def show(self, frame: CameraFrame, name: str, depth_frame: str = "") -> None:
-        """Publish a picture."""
+    def show(self, frame: CameraFrame, name: str, depth_frame: str = "", depth_off: int | None = 0) -> None:
+        """Publish a picture; `depth_off` [ns]: of the depth's stamp from the colour's, None: no depth."""
         height, width = frame.depth.shape
         optical = images.optical_frame(name)
         color = Image(header=convert.header_at(frame.stamp, optical), height=height, width=width, encoding="rgb8")
         color.step, color.data = 3 * width, array("B", frame.rgb.tobytes())
-        depth = Image(header=convert.header_at(frame.stamp, depth_frame or optical), height=height, width=width)
-        depth.encoding, depth.step, depth.data = "32FC1", 4 * width, array("B", frame.depth.tobytes())
         self.color[name].publish(color)
-        self.depth[name].publish(depth)
+        if depth_off is not None:
+            header = convert.header_at(frame.stamp + depth_off, depth_frame or optical)
+            depth = Image(header=header, height=height, width=width, encoding="32FC1", step=4 * width)
+            depth.data = array("B", frame.depth.tobytes())
+            self.depth[name].publish(depth)
 
     def shown(self, frame: CameraFrame, name: str) -> bool:
         """Publish a picture; whether the node says that it waits for the gripper."""
@@ -181,6 +185,70 @@ def test_one_dead_camera_is_named_and_the_other_goes_on(rig: Rig) -> None:
     rig.show_until(lambda: rig.bench.says(WARN, "tracking without cam1"), ("cam0",))
 
 
+def test_what_comes_without_pictures_is_heard_and_does_not_pile_up(rig: Rig) -> None:
+    node, sent = rig.bench.node, 0
+
+    def heard() -> bool:
+        nonlocal sent
+        sent += 1
+        rig.hold(START + sent * STEP)
+        return node.diagnostics.counter(f"messages on {GRIPPER_POSE}") > 10 and not node._news
+
+    rig.close()
+    rig.bench.until(heard, "poses that reached the tracker, without a picture", limit=10.0)
+
+
+def test_one_refused_message_takes_nothing_else_with_it(rig: Rig) -> None:
+    """A pose the tracker refuses, then a good one and a search: both are done. What waits is bounded."""
+    rig.until_found()
+    node: Any = rig.bench.node
+    with node._lock:  # the worker finds all of it at once
+        bad = functools.partial(node._add_grip, pose=PoseFrame(START, np.full((1, 3), np.nan), TURN), closed=CLOSED)
+        good = functools.partial(
+            node._add_grip, pose=PoseFrame(9 * START, rig.scene.gripper[None], TURN), closed=CLOSED
+        )
+        node._news.extend([bad, good])
+        answer = node._on_reset(Trigger.Request(), Trigger.Response())
+    rig.bench.until(lambda: rig.bench.says(ERROR, "gripper pose is not finite"), "the refusal")
+    rig.bench.until(lambda: node._tracker._path.at(9 * START) is not None, "the pose after it")
+    assert answer.success and node._tracker.searching
+    with node._lock:  # a worker that is busy for long
+        node._news.extend([good] * (tracker_node.NEWS + 1))
+        assert len(node._news) == tracker_node.NEWS
+
+
+@pytest.mark.parametrize(
+    ("depth_off", "said"), [(None, "colour without depth"), (5_000_000, "stamps of colour and depth differ by 5 ms")]
+)
+def test_pictures_without_a_partner_are_not_tracking(rig: Rig, depth_off: int | None, said: str) -> None:
+    rig.until_found()
+    count, stamp = len(rig.frames), rig.frames[-1].stamp
+    frames, pause = rig.scene.frames(stamp), 0.05  # [s]
+
+    def shown() -> bool:
+        nonlocal stamp
+        stamp += STEP
+        for name, frame in frames.items():
+            rig.show(dataclasses.replace(frame, stamp=stamp), name, depth_off=depth_off)
+        end = time.monotonic() + pause
+        while time.monotonic() < end:
+            rig.bench.executor.spin_once(timeout_sec=0.01)
+        return rig.bench.says(ERROR, "nothing is tracked", "cam0, cam1", said)
+
+    rig.bench.until(shown, "an error that says why", limit=10.0)
+    assert rig.bench.node.diagnostics.level == ERROR and len(rig.frames) <= count + 2, "a last picture may be under way"
+    rig.show_until(lambda: rig.bench.node.diagnostics.level == OK, NAMES)
+
+
+def test_particles_that_are_not_of_now_are_not_tracking(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever keeps the worker from publishing: the line is of what was published, not of what was meant to be."""
+    rig.until_found()
+    monkeypatch.setattr(tracker_node, "OLD", -1.0)
+    rig.bench.node._heartbeat()
+    assert rig.bench.node.diagnostics.level == WARN
+    assert "the newest particles are 0.0 s old" in rig.bench.node.diagnostics.message
+
+
 def test_camera_pose_in_another_frame_is_refused(rig: Rig) -> None:
     rig.calibrate(rig.scene.frames(START)["cam0"], "cam0", world="map")
     rig.bench.until(lambda: rig.bench.says(ERROR, "cam0/pose", "map", "world"), "an error that names the frame")
@@ -200,6 +268,21 @@ def test_depth_that_is_all_nan_is_named_and_the_run_goes_on(rig: Rig) -> None:
     count = len(rig.frames)
     rig.all(stamp + STEP)
     rig.bench.until(lambda: len(rig.frames) > count, "particles again")
+
+
+def test_depth_in_millimetres_said_to_be_metres_is_named(rig: Rig) -> None:
+    rig.until_found()
+    frame = rig.scene.frames(rig.frames[-1].stamp + STEP)["cam0"]
+    rig.show(dataclasses.replace(frame, depth=1000.0 * frame.depth), "cam0")
+    rig.bench.until(lambda: rig.bench.says(ERROR, "cam0", "are these millimetres?"), "an error that names the unit")
+
+
+def test_particles_that_nobody_sees_are_not_reported_as_fine(rig: Rig) -> None:
+    rig.until_found()
+    rig.show_until(lambda: rig.bench.says(OK, "tracking"), NAMES)
+    rig.scene.move(np.array([3.0, 0.0, 0.0]))  # out of every picture
+    rig.show_until(lambda: rig.bench.says(WARN, "no particle's confidence is above 0.5"), NAMES)
+    assert rig.frames[-1].confidence.max() <= 0.5
 
 
 def test_depth_of_another_frame_is_refused(rig: Rig) -> None:

@@ -95,6 +95,8 @@ def test_points_are_asked_for_by_name_and_folder(tmp_path: Path) -> None:
         make_tracker(TrackerSettings(points="tapnext", points_folder=str(tmp_path)))
     with pytest.raises(ConfigError, match="'points_folder' without 'points'"):
         make_tracker(dataclasses.replace(sheet, points=""))
+    with pytest.raises(ConfigError, match="'points_folder' is empty; allowed: the folder with the weights of tapnext"):
+        make_tracker(TrackerSettings(kind="sheet", points="tapnext"))
     for name in ("a.npz", "b.pt"):
         (tmp_path / name).write_bytes(b"")
     with pytest.raises(ConfigError, match=r"several checkpoints; got a.npz, b.pt"):

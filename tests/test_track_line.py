@@ -321,6 +321,7 @@ def test_bad_input_is_named(tracker: Tracker, scene: HangingRope) -> None:
         tracker.add_frame("cam7", frame)
     for change, words in (
         ({"depth": np.full_like(frame.depth, np.nan)}, "cam0: no pixel has a depth"),
+        ({"depth": 1000.0 * frame.depth}, "cam0: implausible depth, are these millimetres[?].*in metres, or 16UC1"),
         ({"depth": frame.depth[:-1]}, "cam0: colour and depth do not fit"),
         ({"intrinsics": np.zeros((3, 3))}, "cam0: not calibrated"),
         ({"world_from_camera": np.full((4, 4), np.nan)}, "cam0: its pose in world is missing"),
@@ -328,3 +329,6 @@ def test_bad_input_is_named(tracker: Tracker, scene: HangingRope) -> None:
     ):
         with pytest.raises(InputError, match=words):
             tracker.add_frame("cam0", dataclasses.replace(frame, **change))
+    far = frame.depth.copy()
+    far[:80] = 500.0
+    tracker.add_frame("cam0", dataclasses.replace(frame, depth=far))  # wrong in a third of the rows: not the unit

@@ -60,6 +60,13 @@ def test_the_refusal_names_camera_and_clock() -> None:
     assert "check the camera's clock" in str(error.value)
 
 
+def test_the_refusal_of_the_only_camera_does_not_speak_of_others() -> None:
+    clock = PictureClock()
+    clock.take("cam0", 10 * S)
+    with pytest.raises(InputError, match="cam0: a picture 6.1 s ahead of its last one; .*after an outage they do"):
+        clock.take("cam0", round(16.1 * S))
+
+
 @pytest.fixture
 def scene() -> Iterator[HangingRope]:
     rope = HangingRope()

@@ -13,6 +13,7 @@ class PictureClock:
 
     def __init__(self) -> None:
         self._newest: int | None = None  # [ns]
+        self._cameras: set[str] = set()  # those with a picture on the time line
         self._held: dict[str, list[int]] = {}  # camera -> its last stamps off the time line, near to each other
 
     def take(self, camera: str, stamp: int) -> int:
@@ -22,6 +23,7 @@ class PictureClock:
         """
         if self._newest is None or abs(stamp - self._newest) <= LEAP:
             self._newest = max(stamp, self._newest or stamp)
+            self._cameras.add(camera)
             self._held.clear()
             return 0
         own = self._held.get(camera, [])
@@ -30,12 +32,14 @@ class PictureClock:
         leap = stamp - self._newest
         if len(own) < ALONE and not any(abs(stamp - other) <= LEAP for other in others):
             self._held[camera] = own
+            rest = "the others" if self._cameras - {camera} else "its last one"
             raise InputError(
-                f"{camera}: a picture {abs(leap) * 1e-9:.1f} s {'ahead of' if leap > 0 else 'behind'} the others",
+                f"{camera}: a picture {abs(leap) * 1e-9:.1f} s {'ahead of' if leap > 0 else 'behind'} {rest}",
                 got=f"stamp {stamp * 1e-9:.3f} s",
                 allowed=f"within {LEAP * 1e-9:g} s of {self._newest * 1e-9:.3f} s",
-                next_step="It is not used unless other pictures confirm it; check the camera's clock",
+                next_step="Not used unless more confirm it; after an outage they do, else check the camera's clock",
             )
         self._newest = stamp
+        self._cameras = {camera}
         self._held.clear()
         return leap

@@ -149,6 +149,11 @@ def _learned_points(settings: TrackerSettings) -> PointFollower | None:
             "parameter 'points'", got=f"'{settings.points}' for a line", allowed="kind: sheet or volume",
             next_step="Leave it out: a line is followed by its centreline",
         )  # fmt: skip
+    if not settings.points_folder:
+        raise ConfigError(
+            "parameter 'points_folder' is empty", allowed=f"the folder with the weights of {settings.points}",
+            next_step="Name it, or leave 'points' out: optical flow needs no weights",
+        )  # fmt: skip
     from pred_core.track.learned_points import load_points  # torch: seconds, which nobody else here needs
 
     return load_points(settings.points, Path(settings.points_folder))

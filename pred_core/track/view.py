@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pred_core.bag.images import FARTHEST
 from pred_core.errors import InputError
 from pred_core.track.color_model import ColorModel
 from pred_core.track.workspace import Workspace
@@ -14,6 +15,7 @@ from pred_core.types import Array, CameraFrame
 
 Picture = NDArray[np.uint8]
 ROTATION_TOLERANCE = 1e-3
+SAMPLE = 4096  # pixels that judge the unit of a picture's depth
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,16 @@ def check_frame(frame: CameraFrame, camera: str) -> None:
             f"{camera}: no pixel has a depth",
             got=f"{frame.depth.size} x NaN",
             next_step="Check the depth stream and its unit",
+        )
+    sample = frame.depth.ravel()[:: max(1, frame.depth.size // SAMPLE)]
+    known = sample[np.isfinite(sample)]
+    middle = float(np.median(known)) if len(known) else 0.0
+    if middle > FARTHEST:
+        raise InputError(
+            f"{camera}: implausible depth, are these millimetres?",
+            got=f"{middle:.4g} m in the middle of all",
+            allowed=f"up to {FARTHEST:g} m",
+            next_step="Publish 32FC1 in metres, or 16UC1 in millimetres (REP-118)",
         )
 
 
