@@ -76,7 +76,7 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         twin=_twin(study, progress, causes),
         seconds=0.0,
         seed=config.seed,
-        more=(progress.unknown or progress.left) and outcome in ("named", "group"),
+        more=progress.unknown or progress.left,
         explained=progress.explained,
         settings=to_mapping(config),
     )
@@ -85,17 +85,28 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
 
 
 def outcome_of(causes: Sequence[Cause], progress: Progress) -> str:
-    """One of OUTCOMES, from what was named and whether something is left."""
+    """One of OUTCOMES, from what was found and whether something is left: with too little explained it is unknown."""
     physics = [c for c in causes if not c.measured]
     cold = progress.bench.reference is None  # nobody knows there how much there is to explain
     least = progress.bench.config.enough if cold else PARTLY
     if physics and physics[0].contradicted:  # only the nearest law
         return "unknown"
-    if progress.unknown and max((c.closed or 0.0 for c in physics), default=0.0) < least:
+    if progress.unknown and explained_by(causes) < least:
         return "unknown"
     if not causes:
         return "none"
     return "group" if any(c.group for c in causes) else "named"
+
+
+def explained_by(causes: Sequence[Cause]) -> float:
+    """Share of the excess, 0 to 1, that causes explain together.
+
+    Sensor causes are corrected all at once and share what that took away, so their shares add. Physics explains of what
+    is left by then: each cause a share of its own round's excess, of which the largest counts.
+    """
+    sensors = min(sum(c.closed or 0.0 for c in causes if c.measured), 1.0)
+    physics = max((c.closed or 0.0 for c in causes if not c.measured), default=0.0)
+    return 1.0 - (1.0 - sensors) * (1.0 - physics)
 
 
 def _twin(study: Study, progress: Progress, causes: Sequence[Cause]) -> Twin:
