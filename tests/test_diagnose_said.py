@@ -13,7 +13,7 @@ from diagnose_cases import bench_of, quiet
 from report_cases import LINEAR, answer, drag, judged, recorded, rope, with_errors
 
 from pred_core.calibration import Calibration
-from pred_core.diagnose.answer import CHEAP, Study, closed_by_gate, explained_by, outcome_of, refining_of
+from pred_core.diagnose.answer import CHEAP, Study, closed_by_gate, explained_by, floor_of, outcome_of, refining_of
 from pred_core.diagnose.answer import answer as answer_of
 from pred_core.diagnose.causes import causes_of
 from pred_core.diagnose.config import DiagnoseConfig
@@ -24,6 +24,7 @@ from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.ranking import UNSEEN, nothing, ranking
 from pred_core.diagnose.result import Cause, Diagnosis, Value
 from pred_core.diagnose.said import confusions, sentence, unproven, without_interval
+from pred_core.effects import find_effect
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
@@ -266,6 +267,18 @@ def test_outcome_rest_ranking_and_budget_do_not_contradict_each_other(twin: Twin
         assert ("Something else is left" in j["sentence"]) == unknown
         rows = {r["id"]: r["probability"] for r in j["ranking"]}
         assert (rows["unknown"] > 0.5) == unknown and rows["none"] == 0.0
+
+
+def test_the_floor_is_on_the_clock_of_the_reference(twin: Twin) -> None:
+    """A twin that carries a drift: its test episodes are 30 s into the reference's session, whatever the suspect's."""
+    drift = twin.replace(extensions=(find_effect("length_drift").extension(rate=(0.2,)),))
+    known = recorded(twin, (), SPLITS, frames=40)
+    begin = int(known[0].stamps[0])
+    bench: Any = SimpleNamespace(reference_twin=drift)
+    study = Study((), (), tuple(known), twin, gate_of(), bench, begin + 10**12)
+    late = [e for e in known if e.split == "test"]
+    assert floor_of(study, "test") == episode_errors(drift, late, begin).mean > 3.0 * episode_errors(drift, late).mean
+    assert floor_of(study, "ood") is None
 
 
 def test_a_law_that_the_data_contradict_is_no_name(twin: Twin, dragged: list[Episode]) -> None:

@@ -76,6 +76,7 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         twin=_twin(study, progress, causes),
         seconds=0.0,
         seed=config.seed,
+        session=study.session,
         more=progress.unknown or progress.left,
         explained=progress.explained,
         settings=to_mapping(config),
@@ -136,9 +137,17 @@ def _errors(study: Study, progress: Progress, split: str) -> Errors:
     """Base: data as the given twin's own calibration sees it; extended: with what the gate found corrected."""
     before = episode_errors(study.bench.twin, _before(study, split), study.session)
     after = episode_errors(progress.bench.twin, _after(study, split), study.session)
+    return Errors(split, before, after, floor_of(study, split), gain_of(before, after, study.bench.config.seed))
+
+
+def floor_of(study: Study, split: str) -> float | None:
+    """Mean error [mm] of the reference's episodes of a split with its own twin, whose session began with the first of
+    all it was fitted on; None without such episodes."""
     same = [e for e in study.known if e.split == split]
-    floor = episode_errors(study.bench.reference_twin, same).mean if same else None
-    return Errors(split, before, after, floor, gain_of(before, after, study.bench.config.seed))
+    if not same:
+        return None
+    begin = min(int(e.stamps[0]) for e in study.known)
+    return episode_errors(study.bench.reference_twin, same, begin).mean
 
 
 def _before(study: Study, split: str) -> list[Episode]:

@@ -75,7 +75,8 @@ def sentence(d: Diagnosis) -> str:
         share = f"{max(d.explained or 0.0, 0.0):.0%} of the motion"
         found = "; and ".join(called(c) for c in d.causes if c.measured)
         found = f" Measured without it: {found}." if found else ""
-        return f"{label}Your twin explains {share}, too little to tell what it lacks: identify it anew; {numbers}.{found}"
+        poor = f"Your twin explains {share}, too little to tell what it lacks: identify it anew"
+        return f"{label}{poor}; {numbers}.{found}"
     near = next((c for c in d.causes if c.contradicted), None)
     if d.outcome == "unknown" and near is not None:
         beside = "; and ".join(called(c) for c in d.causes if c is not near)
