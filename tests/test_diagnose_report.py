@@ -291,5 +291,5 @@ def test_the_episode_that_is_drawn_has_the_error_of_its_caption(
     assert drawn["base"] == pytest.approx(base.values[k], rel=1e-3)
     assert drawn["extended"] == pytest.approx(extended.values[k], rel=1e-3)
     said = re.search(r"base ([\d.]+) mm, extended ([\d.]+) mm", (tmp_path / "report.html").read_text())
-    assert said and [float(v) for v in said.groups()] == pytest.approx([drawn["base"], drawn["extended"]], rel=2e-3, abs=0.05)
+    assert said and [float(v) for v in said.groups()] == pytest.approx([drawn["base"], drawn["extended"]], abs=0.2)
     assert episode_errors(drift, [test[k]]).mean < 0.5 * extended.values[k], "the clock does nothing here"
