@@ -66,7 +66,7 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         errors_ood=ood,
         budget=budget,
         not_identifiable=tuple(not_identifiable(progress, study.corrected)),
-        not_testable=_not_testable(study.gate, progress),
+        not_testable=not_testable_in(study.gate, progress),
         next_motion=None,
         exploratory=exploratory(study.bench),
         notes=_notes(study, progress, causes, errors, ood, refining),
@@ -196,11 +196,14 @@ def refining_of(study: Study, errors: Errors, took: float) -> str:
     return f"{text}: on the {errors.split} episodes {before:.1f} mm as given, {errors.base.mean:.1f} mm refined"
 
 
-def _not_testable(gate: GateResult, progress: Progress) -> Mapping[str, str]:
+def not_testable_in(gate: GateResult, progress: Progress) -> Mapping[str, str]:
+    """Candidate -> why these data cannot show it. One that they would show, and that is not there, is none of them."""
     rows = {c.id: c.why for c in gate.causes if not c.testable}
+    found = [n.judged.trial.id for n in progress.named]
     for judged, _, why in (row for r in progress.rounds for row in r.judged):
-        if why.startswith("acts in"):
-            rows[judged.trial.id] = f"these motions hardly excite it: it {why}"
+        if why and not judged.testable and judged.trial.id not in found:
+            size = f"{judged.excited or 0} of {len(judged.acts)} episodes"
+            rows[judged.trial.id] = f"these motions hardly excite it: a typical change of it moves {size}"
     return rows
 
 
