@@ -56,6 +56,13 @@ def corrected(dynamics: Dynamics, state: State, position: Tensor, velocity: Tens
     return state.replace(position=position, velocity=velocity)
 
 
+def on_clock(state: State, seconds: Tensor) -> State:
+    """A state that was just started, `seconds` (...) [s] after its session began: what drifts over a session is as far
+    as it is by then. As it is, where nothing in its memory has a clock."""
+    clocks = {k: seconds.to(v) for k, v in state.memory.items() if k.rpartition("/")[2] == "time"}
+    return state.replace(memory={**state.memory, **clocks})
+
+
 def rollout_by_steps(dynamics: Dynamics, state: State, grips: Grip) -> Tensor:
     """The plain `rollout`: one `step` a period. Used by Dynamics that have nothing faster."""
     positions = []

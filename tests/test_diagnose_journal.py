@@ -19,6 +19,9 @@ from pred_core.errors import ConfigError
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
+# A piece of two episodes as version 3 of the journal had it, without `excited`.
+TWO = {"z": [1.0], "null": [0.0], "left_out": [[1.0]], "gain": [1.0] * 2, "moved": [1.0] * 2, "extended": [1.0] * 2}
+
 
 @pytest.fixture(scope="module")
 def twin() -> Twin:
@@ -97,7 +100,8 @@ def test_a_damaged_journal_is_refused(tmp_path: Path, line: str) -> None:
     ("key", "value"),
     [("base", 3), ("base", {"physics": {"stiffness": "soft"}, "extensions": []}), ("x/screen", []),
      ("x/screen", [[[0.1, 0.2], 1.0]]), ("x/quick", [[None], 1.0]), ("x/fit", {"z": [1.0]}),
-     ("x/fit", {"z": [1.0], "null": [0.0], "left_out": [[1.0]], "gain": [1.0], "moved": [1.0], "extended": [1.0]})],
+     ("x/fit", {"z": [1.0], "null": [0.0], "left_out": [[1.0]], "gain": [1.0], "moved": [1.0], "extended": [1.0]}),
+     ("x/fit", TWO), ("x/fit", {**TWO, "excited": "many"})],
 )  # fmt: skip
 def test_a_value_that_no_diagnosis_wrote_is_refused(
     twin: Twin, reference: list[Episode], tmp_path: Path, key: str, value: Any

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +11,16 @@ import pytest
 from report_cases import HOME, answer, drag, recorded, rope, with_errors
 
 from pred_core.calibration import Calibration
+from pred_core.diagnose import pictures
 from pred_core.diagnose.chosen import chosen_of
+from pred_core.diagnose.errors import episode_errors, gain_of
 from pred_core.diagnose.gate import GateCause
 from pred_core.diagnose.map import FEATURES, Replay, conditional, edges_of, from_above, grid_of, replay
 from pred_core.diagnose.next_motion import propose
 from pred_core.diagnose.pictures import whole_of
 from pred_core.diagnose.report import with_clock, write_report
 from pred_core.diagnose.report_parts import budget_rows, span_of
-from pred_core.diagnose.result import Cause, Diagnosis
+from pred_core.diagnose.result import Cause, Diagnosis, Errors
 from pred_core.effects import find_effect
 from pred_core.twin import Twin
 from pred_core.types import Episode
@@ -260,3 +263,33 @@ def test_a_report_opens_with_its_sentence_and_has_every_section(
         assert "do not tell air drag from quadratic air drag" in text
     if d.next_motion is not None:
         assert d.next_motion["name"] in text
+
+
+def test_the_episode_that_is_drawn_has_the_error_of_its_caption(
+    twin: Twin, dragged: list[Episode], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A rope that grows by a fifth a minute, drawn in an episode 50 s and more after the session began: on a clock that
+    starts with the episode it would not have grown.
+    """
+    drift = twin.replace(extensions=(find_effect("length_drift").extension(rate=(0.2,)),))
+    begin, test = int(dragged[0].stamps[0]), [e for e in dragged if e.split == "test"]
+    base, extended = (episode_errors(t, test, begin) for t in (twin, drift))
+    errors = Errors("test", base, extended, 1.0, gain_of(base, extended, 0))
+    d = dataclasses.replace(answer(twin, dragged), errors=errors, twin=drift.replace(base=twin), session=begin)
+    drawn = {}
+
+    def stills(tracks, period, line):  # type: ignore[no-untyped-def]
+        measured = tracks[0][1]
+        drawn.update({n: 1e3 * np.nanmean(np.linalg.norm(p - measured, axis=-1)) for n, p, _ in tracks})
+        return of_tracks(tracks, period, line)
+
+    of_tracks = pictures.stills
+    monkeypatch.setattr(pictures, "stills", stills)
+    write_report(tmp_path / "report.html", d, dragged, None, "now")
+    k = int(np.argsort(base.values)[len(test) // 2])
+    assert int(test[k].stamps[0]) - begin >= 50e9
+    assert drawn["base"] == pytest.approx(base.values[k], rel=1e-3)
+    assert drawn["extended"] == pytest.approx(extended.values[k], rel=1e-3)
+    said = re.search(r"base ([\d.]+) mm, extended ([\d.]+) mm", (tmp_path / "report.html").read_text())
+    assert said and [float(v) for v in said.groups()] == pytest.approx([drawn["base"], drawn["extended"]], abs=0.2)
+    assert episode_errors(drift, [test[k]]).mean < 0.5 * extended.values[k], "the clock does nothing here"

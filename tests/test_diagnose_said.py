@@ -9,18 +9,22 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from diagnose_cases import bench_of, quiet
 from report_cases import LINEAR, answer, drag, judged, recorded, rope, with_errors
 
 from pred_core.calibration import Calibration
-from pred_core.diagnose.answer import CHEAP, Study, closed_by_gate, outcome_of, refining_of
+from pred_core.diagnose.answer import CHEAP, Study, closed_by_gate, explained_by, floor_of, outcome_of, refining_of
+from pred_core.diagnose.answer import answer as answer_of
 from pred_core.diagnose.causes import causes_of
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.errors import episode_errors
 from pred_core.diagnose.gate import GateCause, GateResult
+from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.progress import Named, Progress
-from pred_core.diagnose.ranking import nothing, ranking
-from pred_core.diagnose.result import Cause, Diagnosis
+from pred_core.diagnose.ranking import UNSEEN, nothing, ranking
+from pred_core.diagnose.result import Cause, Diagnosis, Value
 from pred_core.diagnose.said import confusions, sentence, unproven, without_interval
+from pred_core.effects import find_effect
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
@@ -185,6 +189,96 @@ def test_what_the_base_is_and_what_refining_changed(twin: Twin, dragged: list[Ep
     assert refining_of(study, errors, 2.0 * CHEAP) == text.split(":")[0] + ":" + text.split(":")[1]
     bench.reference = None
     assert "refined on the train episodes" in refining_of(study, errors, 2.0 * CHEAP)
+
+
+def delay_of(closed: float | None) -> Cause:
+    """79.9 ms, as the gate measured them."""
+    value = Value(0.0799, "s", 0.0796, 0.0801)
+    return Cause("delay", "delay", 0.9999, {"delay": value}, True, closed, 1e-46)
+
+
+@pytest.mark.parametrize(
+    ("causes", "cold", "outcome"),
+    [
+        ((delay_of(0.58),), False, "named"),
+        ((delay_of(0.29),), False, "unknown"),
+        ((delay_of(None),), False, "unknown"),  # no excess to take a share of
+        ((delay_of(0.58),), True, "unknown"),  # without a reference 60 % are asked for
+        ((delay_of(0.61),), True, "named"),
+        ((delay_of(0.2), dataclasses.replace(delay_of(0.15), id="camera_scale")), False, "named"),
+        ((delay_of(0.2), Cause("wind", "wind", 0.7, {}, False, 0.15)), False, "named"),  # 0.2 + 0.8 x 0.15 = 0.32
+        ((delay_of(0.2), Cause("wind", "wind", 0.7, {}, False, 0.10)), False, "unknown"),  # 0.28
+        ((Cause("wind", "wind", 0.7, {}, False, 0.29),), False, "unknown"),
+        ((), False, "unknown"),
+    ],
+)
+def test_what_was_measured_counts_as_explained(causes: tuple[Cause, ...], cold: bool, outcome: str) -> None:
+    """Where something is left, 30 % of the excess must be explained for a name, by sensor causes as by physics."""
+    progress: Any = progress_of((0, 1))
+    progress.unknown = True
+    progress.bench.reference = None if cold else object()
+    assert outcome_of(causes, progress) == outcome
+    assert 0.0 <= explained_by(causes) <= 1.0
+
+
+def test_a_number_that_was_measured_is_said_whatever_is_left(twin: Twin, dragged: list[Episode]) -> None:
+    """Named with a rest, unknown, or with a twin that is of no use: the delay stands there with its interval."""
+    d = with_error(dataclasses.replace(answer(twin, dragged), causes=(delay_of(0.58),)), (38.1,), (20.9,))
+    said = "a delay of the tracks: 0.0799 s [0.0796, 0.0801]"
+    named = sentence(dataclasses.replace(d, more=True))
+    assert named.startswith(f"Your simulation lacks {said}; with it the held-out error falls from 38.1 to 20.9 mm")
+    assert named.endswith("Something else is left that no candidate explains.")
+    unknown = dataclasses.replace(d, outcome="unknown", more=True)
+    assert f"something that no candidate explains ({said} explains a part); the" in sentence(unknown)
+    poor = sentence(dataclasses.replace(unknown, explained=0.2))
+    assert "identify it anew" in poor and poor.endswith(f"Measured without it: {said}.")
+
+
+def test_a_sensor_cause_says_nothing_of_what_is_left() -> None:
+    """A delay with p 1e-46 and a base whose misfit nothing explains: P(unknown) stays what it is without the delay."""
+    progress: Any = progress_of((0, 1))
+    for unknown in (True, False):
+        progress.unknown = unknown
+        alone, beside = (
+            {r.id: r.probability for r in ranking(gate_of(*causes), progress)} for causes in ((), (measured("delay"),))
+        )
+        assert beside["unknown"] == alone["unknown"] == pytest.approx(1.0 - (UNSEEN if unknown else nothing(1.0)))
+        assert beside["none"] == 0.0 < alone["none"]
+        assert beside["delay"] == 1.0 - nothing(0.01)
+
+
+def test_outcome_rest_ranking_and_budget_do_not_contradict_each_other(twin: Twin, dragged: list[Episode]) -> None:
+    """Tracks that are two frames late, of a rope with drag that no candidate was allowed to explain."""
+    late = [
+        dataclasses.replace(
+            e, tracks=dataclasses.replace(e.tracks, position=np.concatenate((e.position[:1], e.position[:1],
+                                                                             e.position[:-2]))))
+        for e in dragged
+    ]  # fmt: skip
+    bench = bench_of(twin, dragged, recorded(twin, (), SPLITS, seed=100, frames=40))
+    study = Study(tuple(late), tuple(dragged), (), twin, gate_of(measured("delay", p=1e-9)), bench,
+                  int(dragged[0].stamps[0]))  # fmt: skip
+    for unknown in (True, False):
+        progress = Progress(bench, Journal(None, {}), [bench.twin], unknown=unknown)
+        d = answer_of(study, progress, 0.0, quiet)
+        j = d.to_json()
+        assert d.causes[0].id == "delay" and (d.causes[0].closed or 0.0) > 0.3
+        assert j["outcome"] == "named" and j["unexplained_rest"] == unknown
+        assert ("Something else is left" in j["sentence"]) == unknown
+        rows = {r["id"]: r["probability"] for r in j["ranking"]}
+        assert (rows["unknown"] > 0.5) == unknown and rows["none"] == 0.0
+
+
+def test_the_floor_is_on_the_clock_of_the_reference(twin: Twin) -> None:
+    """A twin that carries a drift: its test episodes are 30 s into the reference's session, whatever the suspect's."""
+    drift = twin.replace(extensions=(find_effect("length_drift").extension(rate=(0.2,)),))
+    known = recorded(twin, (), SPLITS, frames=40)
+    begin = int(known[0].stamps[0])
+    bench: Any = SimpleNamespace(reference_twin=drift)
+    study = Study((), (), tuple(known), twin, gate_of(), bench, begin + 10**12)
+    late = [e for e in known if e.split == "test"]
+    assert floor_of(study, "test") == episode_errors(drift, late, begin).mean > 3.0 * episode_errors(drift, late).mean
+    assert floor_of(study, "ood") is None
 
 
 def test_a_law_that_the_data_contradict_is_no_name(twin: Twin, dragged: list[Episode]) -> None:

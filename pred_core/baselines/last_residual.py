@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pred_core.dynamics import Dynamics, rollout_by_steps
+from pred_core.dynamics import Dynamics, on_clock, rollout_by_steps
 from pred_core.types import Grip, State
 
 _RESIDUAL = "last_residual"
@@ -34,16 +34,22 @@ class LastResidual:
         """A start without history: no residual has been measured yet, so it equals the base."""
         return self._with_residual(self.base.start(state, grip), torch.zeros_like(state.velocity))
 
-    def start_after(self, before: State, grip_before: Grip, now: State, grip: Grip) -> tuple[State, Tensor]:
+    def start_after(
+        self, before: State, grip_before: Grip, now: State, grip: Grip, seconds: Tensor | None = None
+    ) -> tuple[State, Tensor]:
         """Start at `now`, one period after `before`, with the residual between them.
 
-        `before`, `now`: measured states. Returns the started state and what the base predicted for `now`
-        from `before`, (..., N, 3) [m]. Held particles have no residual.
+        `before`, `now`: measured states; `seconds` (...) [s]: when in the session `before` was, None: its begin.
+        Returns the started state and what the base predicted for `now` from `before`, (..., N, 3) [m]. Held particles
+        have no residual.
         """
-        predicted = self.base.step(self.base.start(before, grip_before), grip)
+        begun, started = self.base.start(before, grip_before), self.base.start(now, grip)
+        if seconds is not None:
+            begun, started = on_clock(begun, seconds), on_clock(started, seconds + self.period)
+        predicted = self.base.step(begun, grip)
         residual = (now.position - predicted.position) / self.period
         residual = torch.where((now.held >= 0)[..., None], torch.zeros_like(residual), residual)
-        return self._with_residual(self.base.start(now, grip), residual), predicted.position
+        return self._with_residual(started, residual), predicted.position
 
     def step(self, state: State, grip: Grip) -> State:
         """See `Dynamics.step`."""

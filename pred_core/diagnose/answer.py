@@ -66,7 +66,7 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         errors_ood=ood,
         budget=budget,
         not_identifiable=tuple(not_identifiable(progress, study.corrected)),
-        not_testable=_not_testable(study.gate, progress),
+        not_testable=not_testable_in(study.gate, progress),
         next_motion=None,
         exploratory=exploratory(study.bench),
         notes=_notes(study, progress, causes, errors, ood, refining),
@@ -76,7 +76,8 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         twin=_twin(study, progress, causes),
         seconds=0.0,
         seed=config.seed,
-        more=(progress.unknown or progress.left) and outcome in ("named", "group"),
+        session=study.session,
+        more=progress.unknown or progress.left,
         explained=progress.explained,
         settings=to_mapping(config),
     )
@@ -85,17 +86,28 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
 
 
 def outcome_of(causes: Sequence[Cause], progress: Progress) -> str:
-    """One of OUTCOMES, from what was named and whether something is left."""
+    """One of OUTCOMES, from what was found and whether something is left: with too little explained it is unknown."""
     physics = [c for c in causes if not c.measured]
     cold = progress.bench.reference is None  # nobody knows there how much there is to explain
     least = progress.bench.config.enough if cold else PARTLY
     if physics and physics[0].contradicted:  # only the nearest law
         return "unknown"
-    if progress.unknown and max((c.closed or 0.0 for c in physics), default=0.0) < least:
+    if progress.unknown and explained_by(causes) < least:
         return "unknown"
     if not causes:
         return "none"
     return "group" if any(c.group for c in causes) else "named"
+
+
+def explained_by(causes: Sequence[Cause]) -> float:
+    """Share of the excess, 0 to 1, that causes explain together.
+
+    Sensor causes are corrected all at once and share what that took away, so their shares add. Physics explains of what
+    is left by then: each cause a share of its own round's excess, of which the largest counts.
+    """
+    sensors = min(sum(c.closed or 0.0 for c in causes if c.measured), 1.0)
+    physics = max((c.closed or 0.0 for c in causes if not c.measured), default=0.0)
+    return 1.0 - (1.0 - sensors) * (1.0 - physics)
 
 
 def _twin(study: Study, progress: Progress, causes: Sequence[Cause]) -> Twin:
@@ -125,9 +137,17 @@ def _errors(study: Study, progress: Progress, split: str) -> Errors:
     """Base: data as the given twin's own calibration sees it; extended: with what the gate found corrected."""
     before = episode_errors(study.bench.twin, _before(study, split), study.session)
     after = episode_errors(progress.bench.twin, _after(study, split), study.session)
+    return Errors(split, before, after, floor_of(study, split), gain_of(before, after, study.bench.config.seed))
+
+
+def floor_of(study: Study, split: str) -> float | None:
+    """Mean error [mm] of the reference's episodes of a split with its own twin, whose session began with the first of
+    all it was fitted on; None without such episodes."""
     same = [e for e in study.known if e.split == split]
-    floor = episode_errors(study.bench.reference_twin, same).mean if same else None
-    return Errors(split, before, after, floor, gain_of(before, after, study.bench.config.seed))
+    if not same:
+        return None
+    begin = min(int(e.stamps[0]) for e in study.known)
+    return episode_errors(study.bench.reference_twin, same, begin).mean
 
 
 def _before(study: Study, split: str) -> list[Episode]:
@@ -176,11 +196,14 @@ def refining_of(study: Study, errors: Errors, took: float) -> str:
     return f"{text}: on the {errors.split} episodes {before:.1f} mm as given, {errors.base.mean:.1f} mm refined"
 
 
-def _not_testable(gate: GateResult, progress: Progress) -> Mapping[str, str]:
+def not_testable_in(gate: GateResult, progress: Progress) -> Mapping[str, str]:
+    """Candidate -> why these data cannot show it. One that they would show, and that is not there, is none of them."""
     rows = {c.id: c.why for c in gate.causes if not c.testable}
+    found = [n.judged.trial.id for n in progress.named]
     for judged, _, why in (row for r in progress.rounds for row in r.judged):
-        if why.startswith("acts in"):
-            rows[judged.trial.id] = f"these motions hardly excite it: it {why}"
+        if why and not judged.testable and judged.trial.id not in found:
+            size = f"{judged.excited or 0} of {len(judged.acts)} episodes"
+            rows[judged.trial.id] = f"these motions hardly excite it: a typical change of it moves {size}"
     return rows
 
 

@@ -68,9 +68,12 @@ def gain_of(base: EpisodeErrors, extended: EpisodeErrors, seed: int) -> Gain:
     return Gain(mean, low, high, int((difference > 0).sum()), len(difference))
 
 
-def predicted(twin: Twin, episode: Episode) -> tuple[Array, Array]:
-    """(predicted (K, N, 3), measured (K, N, 3) with NaN where not seen) [m] of one whole episode, for pictures."""
-    sample = make_sample([episode], twin, WHOLE)
+def predicted(twin: Twin, episode: Episode, begin: int | None = None) -> tuple[Array, Array]:
+    """(predicted (K, N, 3), measured (K, N, 3) with NaN where not seen) [m] of one whole episode, for pictures.
+
+    `begin` as in `episode_errors`, whose error of the episode this is.
+    """
+    sample = make_sample([episode], twin, WHOLE, begin)
     roller = Roller(twin, sample)
     positions = roller.positions(Candidate(twin.physics, twin.extensions))[0]
     target = torch.where(sample.windows.seen[:, 0, :, None], sample.windows.target[:, 0], torch.nan)

@@ -17,6 +17,7 @@ FLIPS = 20_000
 DIGITS = 9  # of a sum of gains, as a share of their sizes: the unflipped draw must count, whatever its rounding
 FEWEST_GROUPS = 10  # 2^-10 is the smallest p value they can show; with six a single quiet one decides
 ACTS = 0.1  # standard deviations of a residual by which a cause must move an episode to count as acting in it
+FEWEST_ACTING = 4  # episodes in which a cause must act to be named, and that it must be able to move to be testable
 SLIGHT = 0.05  # of the mean gain: an episode that loses less is not worse
 NESTED = 0.06  # of the best gain: with fewer parameters, so little less is the better name
 SIMILAR = 0.1  # the same where it is also within one standard error
@@ -38,6 +39,7 @@ class Judged:
     acts: NDArray[np.bool_]  # (E,) it moves the episode by itself, whatever is refitted beside it
     extended: Array  # (E,) loss with it
     z: Array  # coordinates of `values`
+    excited: int | None = None  # episodes that a typical change of it would move; None: not asked, it acts in enough
 
     @property
     def mean(self) -> float:
@@ -58,6 +60,13 @@ class Judged:
     def improved(self) -> tuple[int, int]:
         """(episodes that improve, episodes in which it acts)."""
         return int((self.gain[self.acts] > 0).sum()), int(self.acts.sum())
+
+    @property
+    def testable(self) -> bool:
+        """These motions excite it, wherever its fit ended: it acts in FEWEST_ACTING episodes, or would if it were
+        there. A cause that ended at no change although it would act is absent.
+        """
+        return max(int(self.acts.sum()), self.excited or 0) >= min(FEWEST_ACTING, len(self.acts))
 
     @property
     def worse(self) -> int:

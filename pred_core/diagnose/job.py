@@ -15,7 +15,7 @@ from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.errors import DatasetError, TwinError
 from pred_core.twin import Twin
 
-VERSION = 3  # of the journal's pieces
+VERSION = 4  # of the journal's pieces
 GRAVITY_APART = 0.01 * 9.81  # [m/s^2] declared gravities may differ by, as vectors: 0.6 degrees of tilt
 SHOWN = 5  # bags in a line
 _FALLBACK = "what it was asked cannot be read"

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pred_core.diagnose.config import DiagnoseConfig
-from pred_core.diagnose.evidence import ACTS, Judged
+from pred_core.diagnose.evidence import ACTS, FEWEST_ACTING, Judged
 from pred_core.diagnose.fit import IN_FULL, USUAL, Target, fit, graduated, rho, without_groups
 from pred_core.diagnose.journal import Journal, vector
 from pred_core.diagnose.places import Start
@@ -191,6 +192,7 @@ def _judged(trial: Trial, episodes: int, values: Mapping[str, Any]) -> Judged:
         acts=vector(values["moved"], episodes) > ACTS,
         extended=vector(values["extended"], episodes),
         z=z,
+        excited=None if values["excited"] is None else int(values["excited"]),
     )
 
 
@@ -210,7 +212,8 @@ def _judge(bench: Bench, screened: Screened) -> dict[str, object]:
     for row, group in enumerate(left_out if bench.config.cross_fit else ()):
         mine = sample.groups == group  # also test episodes of that recording
         extended[mine] = losses[3 + row][mine]
-    moved = np.sqrt(np.maximum(target.per_episode((u[1] - u[2]).square()[None])[0], 0.0))
+    moved = _moved(target, u[1] - u[2])
+    few = int((moved > ACTS).sum()) < FEWEST_ACTING
     return {
         "z": result.z.tolist(),
         "null": null.tolist(),
@@ -218,7 +221,27 @@ def _judge(bench: Bench, screened: Screened) -> dict[str, object]:
         "gain": (losses[0] - extended).tolist(),
         "extended": extended.tolist(),
         "moved": moved.tolist(),
+        "excited": int((excitation(target, trial, result.z, without) > ACTS).sum()) if few else None,
     }
+
+
+def excitation(target: Target, trial: Trial, z: Array, without: Array) -> Array:
+    """(E,) standard deviations by which a typical change of what switches a trial on moves each episode from `without`
+    it, where `z` has its place and shape: what the motions would show, whatever the fit made of the size.
+    """
+    there = without.copy()
+    for n, knob in enumerate(trial.space.knobs):
+        if n in trial.amplitudes:
+            there[n] += 1.0 if without[n] + 1.0 <= knob.coordinate(knob.high) else -1.0
+        elif any(knob.name.startswith(f"{id}.") for id in trial.ids):
+            there[n] = z[n]
+    one, other = target.residuals(trial.space, [without, there])
+    return _moved(target, other - one)
+
+
+def _moved(target: Target, difference: Tensor) -> Array:
+    """(E,) root mean square of a difference of residuals (W, K, N, 3)."""
+    return np.sqrt(np.maximum(target.per_episode(difference.square()[None])[0], 0.0))
 
 
 def intervals(trial: Trial, z: Array, null: Array, left_out: Array) -> dict[str, tuple[float, float]]:

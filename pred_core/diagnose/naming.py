@@ -6,7 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pred_core.diagnose.evidence import FEWEST_GROUPS, Judged, elsewhere, family_wise, rivals, set_limit, simplest
+from pred_core.diagnose.evidence import (
+    FEWEST_ACTING,
+    FEWEST_GROUPS,
+    Judged,
+    elsewhere,
+    family_wise,
+    rivals,
+    set_limit,
+    simplest,
+)
 from pred_core.diagnose.judge import Bench
 from pred_core.diagnose.progress import Named, Progress
 
@@ -78,11 +87,13 @@ def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress
         return f"leaves {j.left:.3f} of the loss, where {without:.3f} are left without it"
     acting = int(j.acts.sum())
     if exploratory(progress.bench):  # no inference: what helps everywhere, and much, is named as exploratory
-        if acting == 0 or j.worse:
+        if acting == 0:
+            return _idle(j)
+        if j.worse:
             return f"{j.worse} of {acting} episodes get worse"
         return "" if j.mean >= max(EXPLORATORY * whole, least) else f"saves too little ({j.mean:.3f} of the loss)"
-    if acting < 4:
-        return f"acts in {acting} episodes only"
+    if acting < FEWEST_ACTING:
+        return _idle(j)
     if p > config.level:
         return f"not significant (adjusted p {p:.3f})"
     if j.mean < least:
@@ -92,6 +103,11 @@ def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress
     if not j.excludes_null:
         return "its interval includes no change"
     return ""
+
+
+def _idle(j: Judged) -> str:
+    acts = f"acts in {int(j.acts.sum())} episodes only"
+    return f"fitted to no change: it {acts}, though these motions excite it" if j.testable else acts
 
 
 def share_closed(j: Judged, excess: float, floor: float) -> float:

@@ -47,8 +47,10 @@ def confidence(named: Named, floor: bool) -> float:
 def ranking(gate: GateResult, progress: Progress) -> list[Ranked]:
     """What was named, the finalists of the first round, "unknown" and "none".
 
-    Named causes have each their own probability: several can be there at once. The first round's candidates, unknown
-    and none share what is left by the causes named before it.
+    Several causes can be there at once. So those named before or after the first round, by the gate or by a later one,
+    have each a probability of their own. The first round's candidates and "unknown" (it has no name, or another one)
+    answer what the simulation lacks besides: what they leave of 1 is that it lacks nothing more. "none" has that where
+    nothing was named before, and 0 once anything was.
     """
     floor = progress.bench.reference is not None
     before = [
@@ -59,9 +61,8 @@ def ranking(gate: GateResult, progress: Progress) -> list[Ranked]:
     before += [_row(n, confidence(n, floor)) for n in progress.named if n.round < 0]
     later = [_row(n, confidence(n, floor)) for n in progress.named if n.round > 0]
     first = _first_round(progress, floor)
-    left = 1.0 - max((r.probability for r in before), default=0.0)
-    if before and not any(n.round == 0 for n in progress.named):
-        first = [dataclasses.replace(r, probability=r.probability * left) for r in first]
+    if before:
+        first = [dataclasses.replace(r, probability=0.0) if r.id == "none" else r for r in first]
     seen = {r.id for r in (*before, *later)}
     return sorted((*before, *later, *(r for r in first if r.id not in seen)), key=lambda r: (-r.probability, -r.gain))
 

@@ -62,7 +62,7 @@ def write_report(
 def replays(d: Diagnosis, episodes: Sequence[Episode], reference: Sequence[Episode] | None) -> list[Replay]:
     """Base and, if anything was named, extended over the train and test episodes; the base over the reference's."""
     mine = [e for e in episodes if e.split != "ood"]
-    begin = min(int(e.stamps[0]) for e in mine)
+    begin = min(int(e.stamps[0]) for e in mine) if d.session is None else d.session
     rows = [replay("base", d.base_twin, mine, _given(d), begin)]
     if d.causes:
         rows.append(replay("extended", d.twin, mine, d.twin.calibration, begin))
@@ -115,8 +115,8 @@ def _overlay(page: Page, d: Diagnosis, episodes: Sequence[Episode]) -> None:
     names, values = d.errors.base.names, d.errors.base.values
     name = names[int(np.argsort(values)[len(names) // 2])]
     episode = next(e for e in episodes if e.name == name)
-    base, measured = predicted(d.base_twin, _given(d).correct(episode))
-    extended, corrected = predicted(d.twin, d.twin.calibration.correct(episode))
+    base, measured = predicted(d.base_twin, _given(d).correct(episode), d.session)
+    extended, corrected = predicted(d.twin, d.twin.calibration.correct(episode), d.session)
     frames = min(len(base), len(extended))
     held = "held-out " if d.errors.split == "test" else ""
     page.heading(f"{'Before and after: ' if d.causes else 'As it is: '}{held}episode {name}")

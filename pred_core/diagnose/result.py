@@ -89,6 +89,7 @@ class Diagnosis:
     twin: Twin  # carries what was named
     seconds: float
     seed: int
+    session: int | None = None  # [ns] when the session of these episodes began; None: with the first of them
     more: bool = False  # beside what was named something is left that no candidate explains
     explained: float | None = None  # share of the motion in windows of held-out episodes; None: it hardly moves
     settings: Mapping[str, Any] = field(default_factory=dict)  # of the run

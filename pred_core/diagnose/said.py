@@ -73,7 +73,10 @@ def sentence(d: Diagnosis) -> str:
         return f"{label}Nothing is found that your simulation lacks: its {held} is {e.base.mean:.1f} mm{share}."
     if d.outcome == "unknown" and _no_base(d):
         share = f"{max(d.explained or 0.0, 0.0):.0%} of the motion"
-        return f"{label}Your twin explains {share}, too little to tell what it lacks: identify it anew; {numbers}."
+        found = "; and ".join(called(c) for c in d.causes if c.measured)
+        found = f" Measured without it: {found}." if found else ""
+        poor = f"Your twin explains {share}, too little to tell what it lacks: identify it anew"
+        return f"{label}{poor}; {numbers}.{found}"
     near = next((c for c in d.causes if c.contradicted), None)
     if d.outcome == "unknown" and near is not None:
         beside = "; and ".join(called(c) for c in d.causes if c is not near)
@@ -83,8 +86,8 @@ def sentence(d: Diagnosis) -> str:
             f"{near.contradicted}; with it {numbers}.{beside}"
         )
     if d.outcome == "unknown":
-        some = ", ".join(NAMES.get(c.id, c.id) for c in d.causes)
-        partly = f" ({some} explains a part)" if some else ""
+        some = "; and ".join(called(c) if c.measured else NAMES.get(c.id, c.id) for c in d.causes)
+        partly = f" ({some} explain{'s' if len(d.causes) == 1 else ''} a part)" if some else ""
         return f"{label}Your simulation lacks something that no candidate explains{partly}; {numbers}."
     what = "; and ".join(called(c) + (f" (nearly: {c.contradicted})" if c.contradicted else "") for c in d.causes)
     group = tuple(g for c in d.causes for g in c.group)

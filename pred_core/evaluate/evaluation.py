@@ -62,21 +62,30 @@ class EpisodeStore:
                 self._read[entry.bag] = self.calibration.correct(self.dataset.read(entry))
         return [self._read[e.bag] for e in entries]
 
+    def session(self) -> int:
+        """[ns] when the session began, as a diagnosis has it: the first stamp of all episodes, of any split.
+
+        Raises: BagError.
+        """
+        return min(int(e.stamps[0]) for e in self.read(self.dataset.entries))
+
 
 def run_model(model: Model, split: Split, store: EpisodeStore, cache: PredictionCache, say: Progress) -> Result:
     """Predict and score every fold of `split`. Raises: PredError of the model or the data."""
     episodes: list[Episode] = []
     predictions: list[Array] = []
     trained_on, same_recording = 0, 0
+    begin = store.session() if model.drifts else None
     for index, fold in enumerate(split.folds):
         number = index if split.grouped else None
         test = store.read(fold.test)
         check_episodes(test)
-        key = cache.key(model.digest, f"{fold.digest}{_corrected(store.calibration)}", number)
+        clock = "" if begin is None else f" session from {begin}"
+        key = cache.key(model.digest, f"{fold.digest}{_corrected(store.calibration)}{clock}", number)
         found = cache.load(key, [(len(e.stamps) - FIRST_PREDICTED, len(e.tracks.id), 3) for e in test])
         if found is None:
             dynamics = model.build(test, store.read(fold.train), number)
-            found = [p.astype(np.float32).astype(np.float64) for p in predict(dynamics, test)]
+            found = [p.astype(np.float32).astype(np.float64) for p in predict(dynamics, test, begin)]
             cache.store(key, found)
             say(f"{model.name} on {split.name}" + (f" fold {index + 1}/{len(split.folds)}" if split.grouped else ""))
         else:

@@ -11,6 +11,7 @@ import numpy as np
 from pred_core.baselines import BlendedEnds, ConstantVelocity, LastResidual, Persistence, fit_static_regression
 from pred_core.calibration import Calibration
 from pred_core.dynamics import Dynamics
+from pred_core.effects import find_effect
 from pred_core.errors import ConfigError, DatasetError, TwinError, nearest
 from pred_core.evaluate.splits import HashedFold
 from pred_core.pred import load_dynamics
@@ -18,6 +19,7 @@ from pred_core.twin import Twin
 from pred_core.types import Episode
 
 BASELINES = ("persistence", "constant-velocity", "blended-ends", "static-regression", "last-residual")
+DIAGNOSIS = "pred diagnose"  # what it writes as `found_by` into the evidence of an extension
 Build = Callable[[Sequence[Episode], Sequence[Episode], int | None], Dynamics]
 
 
@@ -35,6 +37,7 @@ class Model:
     lacking: str = ""  # why the fold twins are not this model; "": they are
     fitted_on: tuple[str, ...] = ()  # sha256 of the bags the twin saw
     fold_fitted_on: tuple[tuple[str, ...], ...] = ()  # the same of every fold twin; empty where it stores none
+    drifts: bool = False  # something in it changes over a session: its predictions go by the session's clock
 
 
 @dataclass(frozen=True)
@@ -150,11 +153,20 @@ def _twin_model(name: str, named: NamedTwin, *, extensions: bool, residual: bool
         check_fits(twin, test[0], name)
         return load_dynamics(twin, extensions=extensions, residual=residual)
 
-    digests = [t.digest() for t in (named.twin, *named.folds)]
+    twins = (named.twin, *named.folds)
+    drifts = extensions and any(_drifts(t) and not (residual and t.residual is not None) for t in twins)
+    digests = [t.digest() for t in twins]
     return Model(
         name, f"{' '.join(digests)} extensions={extensions} residual={residual}", build, len(named.folds),
         _lacking(named, extensions, residual), named.twin.meta.data, tuple(t.meta.data for t in named.folds),
+        drifts,
     )  # fmt: skip
+
+
+def _drifts(twin: Twin) -> bool:
+    """Whether a diagnosis found that something drifts. `pred identify` and `pred train` have the clock of what drifts
+    at 0 wherever they start, so what they make is scored on that clock."""
+    return any(find_effect(e.id).family == "drift" and e.evidence.get("found_by") == DIAGNOSIS for e in twin.extensions)
 
 
 def _baseline(name: str, base: NamedTwin | None) -> Model:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pred_core.dynamics import FARTHEST, Dynamics
+from pred_core.dynamics import FARTHEST, Dynamics, on_clock
 from pred_core.errors import DatasetError, DivergenceError, TwinError
 from pred_core.train.recordings import PERIOD_TOLERANCE
 from pred_core.types import Array, Episode, Grip, State, stack_grips, stack_states
@@ -22,12 +22,16 @@ FIRST_PREDICTED = START_FRAME + 1
 class UsesOneMoreFrame(Protocol):
     """A Dynamics that also needs the frame after the start (`LastResidual`)."""
 
-    def start_after(self, before: State, grip_before: Grip, now: State, grip: Grip) -> tuple[State, Tensor]:
-        """The state started at `now`, and the base's own prediction of it."""
+    def start_after(
+        self, before: State, grip_before: Grip, now: State, grip: Grip, seconds: Tensor | None = None
+    ) -> tuple[State, Tensor]:
+        """The state started at `now`, and the base's own prediction of it. `seconds` [s] of the session at `before`."""
 
 
-def predict(dynamics: Dynamics, episodes: Sequence[Episode]) -> list[Array]:
+def predict(dynamics: Dynamics, episodes: Sequence[Episode], begin: int | None = None) -> list[Array]:
     """Open-loop predictions of frames 2 .. T-1 of every episode, each (T-2, P, 3) [m] world.
+
+    `begin` [ns]: when their session began, for what drifts over it; None: every episode is at its begin.
 
     Episodes of equal length run as one batch. From the step at which an episode diverges its prediction is
     NaN (see `diverged_at`); the other episodes of the batch are unaffected.
@@ -46,7 +50,7 @@ def predict(dynamics: Dynamics, episodes: Sequence[Episode]) -> list[Array]:
         groups.setdefault((len(episode.stamps), episode.grips.position.shape[1]), []).append(i)
     predictions: dict[int, Array] = {}
     for indices in groups.values():
-        for i, position in zip(indices, _predict_batch(dynamics, [episodes[i] for i in indices]), strict=True):
+        for i, position in zip(indices, _predict_batch(dynamics, [episodes[i] for i in indices], begin), strict=True):
             predictions[i] = position
     return [predictions[i] for i in range(len(episodes))]
 
@@ -76,27 +80,36 @@ def diverged_at(prediction: Array) -> int | None:
     return int(bad.argmax()) + 1 if bad.any() else None
 
 
-def _predict_batch(dynamics: Dynamics, episodes: Sequence[Episode]) -> list[Array]:
+def _predict_batch(dynamics: Dynamics, episodes: Sequence[Episode], begin: int | None) -> list[Array]:
     """Equal lengths, equal numbers of grippers."""
+    seconds = None if begin is None else _seconds(episodes, begin)
     grips = stack_grips([e.grips for e in episodes], dim=1)
     frames = grips.position.shape[0]
     with torch.no_grad():
         first: Tensor | None = None
         if isinstance(dynamics, UsesOneMoreFrame):
             before, now = (stack_states([e.state_at(START_FRAME + k) for e in episodes]) for k in (0, 1))
-            state, predicted = dynamics.start_after(before, grips.at(START_FRAME), now, grips.at(FIRST_PREDICTED))
-            first, begin = predicted[None], FIRST_PREDICTED + 1
+            state, predicted = dynamics.start_after(
+                before, grips.at(START_FRAME), now, grips.at(FIRST_PREDICTED), seconds
+            )
+            first, first_step = predicted[None], FIRST_PREDICTED + 1
         else:
             state = stack_states([e.state_at(START_FRAME) for e in episodes])
-            state, begin = dynamics.start(state, grips.at(START_FRAME)), FIRST_PREDICTED
+            state, first_step = dynamics.start(state, grips.at(START_FRAME)), FIRST_PREDICTED
+            state = state if seconds is None else on_clock(state, seconds)
         try:
-            positions = dynamics.rollout(state, grips.span(begin, frames))
+            positions = dynamics.rollout(state, grips.span(first_step, frames))
         except DivergenceError:
-            positions = _one_by_one(dynamics, state, grips.span(begin, frames))
+            positions = _one_by_one(dynamics, state, grips.span(first_step, frames))
     if first is not None:
         positions = torch.cat((first, positions))
     whole = positions.double().numpy(force=True)
     return [_cut(whole[:, i]) for i in range(len(episodes))]
+
+
+def _seconds(episodes: Sequence[Episode], begin: int) -> Tensor:
+    """(B,) [s] of the session at the frame that predictions start from."""
+    return torch.tensor([(int(e.stamps[START_FRAME]) - begin) * 1e-9 for e in episodes], dtype=torch.float32)
 
 
 def _one_by_one(dynamics: Dynamics, state: State, grips: Grip) -> Tensor:
