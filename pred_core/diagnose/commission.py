@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pred_core.config import from_mapping
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.fit import Target, fit
 from pred_core.diagnose.journal import Journal, vector
@@ -112,14 +113,18 @@ def values_of(twin: Twin) -> dict[str, Any]:
 
 
 def with_stored(twin: Twin, values: dict[str, Any]) -> Twin:
-    """The twin at stored values. Raises: KeyError, TypeError or ValueError if they are not of this twin."""
+    """The twin at stored values. Raises: KeyError, TypeError or ValueError if they are not of this twin, or lie outside
+    what their parameters allow."""
     extensions = tuple(
         dataclasses.replace(e, parameters={k: tuple(found[k]) for k in e.parameters})
         for e, found in zip(twin.extensions, values["extensions"], strict=True)
     )
     numbers = [*values["physics"].values(), *(v for e in extensions for row in e.parameters.values() for v in row)]
     vector(numbers, len(numbers))
-    return twin.replace(physics=Physics(**values["physics"]), extensions=extensions)
+    for e in extensions:
+        find_effect(e.id).check(e)
+    physics = {f.name: values["physics"][f.name] for f in dataclasses.fields(Physics)}  # all, none by its default
+    return twin.replace(physics=from_mapping(Physics, physics, "physics"), extensions=extensions)
 
 
 def _polish(twin: Twin, sample: Sample, use: NDArray[np.bool_], config: DiagnoseConfig, tell: Tell) -> Twin:

@@ -7,7 +7,9 @@ the line's chords. It is a cause of another kind than the effects: the springs t
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +17,7 @@ from pred_core.diagnose.commission import base_fields, refined, values_of, with_
 from pred_core.diagnose.evidence import Judged, family_wise
 from pred_core.diagnose.fit import Target
 from pred_core.diagnose.journal import Journal
-from pred_core.diagnose.judge import Bench, Tell
+from pred_core.diagnose.judge import JACKKNIFE, Bench, Tell
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.trial import Trial, make_trial
 from pred_core.effects import find_effect
@@ -116,19 +118,23 @@ def _asked(bench: Bench, beside: tuple[type[Effect], ...], journal: Journal, key
             rows.append([int(group), values_of(own)])
         return {"twin": values_of(twin), "without": rows}
 
-    stored = journal.once(key, fit_chain)
-    twin = with_stored(slim, stored["twin"])
+    def read(stored: dict[str, Any]) -> tuple[Twin, dict[int, Twin]]:
+        without = {int(group): with_stored(slim, values) for group, values in stored["without"]}
+        if set(without) != set(fitted.roller.sample.groups.tolist()):
+            raise ValueError(f"fits without {len(without)} recordings, expected one without each")
+        return with_stored(slim, stored["twin"]), without
+
+    twin, without = journal.piece(key, fit_chain, read)
     base = _losses(bench.twin, target)
     extended = _losses(twin, target)
-    for group, values in stored["without"] if bench.config.cross_fit else ():
+    for group, other in without.items() if bench.config.cross_fit else ():
         mine = target.roller.sample.groups == group
         if mine.any():
-            extended[mine] = _losses(with_stored(slim, values), target)[mine]
+            extended[mine] = _losses(other, target)[mine]
     trial = _trial(twin)
     knobs = trial.space.knobs
-    spread = [with_stored(slim, v).physics.bending_stiffness for _, v in stored["without"]]
     value = twin.physics.bending_stiffness
-    width = 1.645 * float(np.std(spread)) * (len(spread) - 1) ** 0.5 if len(spread) > 1 else value  # one: not known
+    width = _width([t.physics.bending_stiffness for t in without.values()], value)
     judged = Judged(
         trial=trial,
         values={k.name: value for k in knobs},
@@ -140,6 +146,13 @@ def _asked(bench: Bench, beside: tuple[type[Effect], ...], journal: Journal, key
         z=trial.space.start(),
     )
     return _Asked(twin, judged)
+
+
+def _width(spread: Sequence[float], value: float) -> float:
+    """Half a 90 % interval of the value, by the jackknife over recordings as `judge.intervals` has it; of one recording
+    nothing is known."""
+    groups = len(spread)
+    return JACKKNIFE.get(groups, 1.8) * float(np.std(spread)) * (groups - 1) ** 0.5 if groups > 1 else value
 
 
 def _with(twin: Twin, effects: tuple[type[Effect], ...]) -> Twin:
