@@ -13,7 +13,7 @@ from report_cases import LINEAR, answer, drag, judged, recorded, rope, with_erro
 
 from pred_core.calibration import Calibration
 from pred_core.diagnose.answer import CHEAP, Study, closed_by_gate, outcome_of, refining_of
-from pred_core.diagnose.causes import causes_of
+from pred_core.diagnose.causes import causes_of, evidence_of
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.errors import episode_errors
 from pred_core.diagnose.gate import GateCause, GateResult
@@ -111,15 +111,28 @@ def test_a_sensor_cause_was_not_judged_on_windows(twin: Twin, dragged: list[Epis
 def test_what_only_bounds_the_search_is_called_no_interval(
     twin: Twin, dragged: list[Episode], groups: Sequence[int], low: float, high: float, known: bool
 ) -> None:
-    """The search for drag goes from 0 to 50 /s. `diagnosis.json` keeps its numbers and a note says what they are."""
-    causes = causes_of(gate_of(), progress_of(groups, drag_named(twin, low, high)), {"drag_linear": 0.9}, {})
+    """The search for drag goes from 0 to 50 /s. `diagnosis.json` has null, and a note says so."""
+    progress = progress_of(groups, drag_named(twin, low, high))
+    causes = causes_of(gate_of(), progress, {"drag_linear": 0.9}, {})
     value = causes[0].parameters["coefficient"]
     assert (value.low, value.high, value.interval) == (low, high, known)
     d = dataclasses.replace(answer(twin, dragged), causes=causes)
     assert ("1.5 1/s (no interval)" in sentence(d)) == (not known)
     assert ("1.5 1/s [1.2, 1.8]" in sentence(d)) == known
     assert ("no interval for air drag (coefficient)" in without_interval(causes)) == (not known)
-    assert d.to_json()["causes"][0]["parameters"]["coefficient"]["high"] == high
+    told = d.to_json()["causes"][0]["parameters"]["coefficient"]
+    assert (told["low"], told["high"]) == ((low, high) if known else (None, None))
+    kept = evidence_of(drag()[0], progress).evidence["interval"]["drag_linear.coefficient[0]"]
+    assert kept == ([low, high] if known else None)
+
+
+def test_one_episode_gives_the_gain_no_interval(twin: Twin, dragged: list[Episode]) -> None:
+    """No 95 % interval of width 0; with two episodes it has one."""
+    for count, known in ((1, False), (2, True)):
+        d = with_error(answer(twin, dragged), (12.0, 14.0)[:count], (8.0, 9.0)[:count])
+        gain = d.to_json()["gain"]
+        assert (gain["low_mm"] is not None) == (gain["high_mm"] is not None) == known
+        assert gain["mean_mm"] == pytest.approx(4.0 if count == 1 else 4.5)
 
 
 def test_a_correction_closes_what_it_takes_away(twin: Twin, dragged: list[Episode]) -> None:

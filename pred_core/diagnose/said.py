@@ -126,7 +126,7 @@ def without_interval(causes: Sequence[Cause]) -> str:
     ]
     if not rows:
         return ""
-    return f"no interval for {', '.join(rows)}: what diagnosis.json has as low and high only bounds the search"
+    return f"no interval for {', '.join(rows)}: low and high are null in diagnosis.json"
 
 
 def _no_base(d: Diagnosis) -> bool:
