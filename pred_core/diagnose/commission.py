@@ -19,7 +19,7 @@ from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.sample import Sample, make_sample
 from pred_core.diagnose.trial import make_trial
 from pred_core.diagnose.weigh import Weights, misfit_of, seen_of, weigh
-from pred_core.effects import find_effect
+from pred_core.effects import effect_of, find_effect
 from pred_core.effects.effect import Effect
 from pred_core.errors import ConfigError, DatasetError
 from pred_core.identify.space import Candidate
@@ -122,7 +122,7 @@ def with_stored(twin: Twin, values: dict[str, Any]) -> Twin:
     numbers = [*values["physics"].values(), *(v for e in extensions for row in e.parameters.values() for v in row)]
     vector(numbers, len(numbers))
     for e in extensions:
-        find_effect(e.id).check(e)
+        effect_of(e)
     physics = {f.name: values["physics"][f.name] for f in dataclasses.fields(Physics)}  # all, none by its default
     return twin.replace(physics=from_mapping(Physics, physics, "physics"), extensions=extensions)
 
