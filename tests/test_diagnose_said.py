@@ -19,8 +19,9 @@ from pred_core.diagnose.errors import episode_errors
 from pred_core.diagnose.gate import GateCause, GateResult
 from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.ranking import nothing, ranking
-from pred_core.diagnose.result import Cause, Diagnosis
-from pred_core.diagnose.said import confusions, sentence, unproven, without_interval
+from pred_core.diagnose.result import Cause, Diagnosis, Value
+from pred_core.diagnose.said import called, confusions, sentence, unproven, without_interval
+from pred_core.effects import LIBRARY
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
@@ -124,6 +125,34 @@ def test_what_only_bounds_the_search_is_called_no_interval(
     assert (told["low"], told["high"]) == ((low, high) if known else (None, None))
     kept = evidence_of(drag()[0], progress).evidence["interval"]["drag_linear.coefficient[0]"]
     assert kept == ([low, high] if known else None)
+
+
+# The parameter that a person would ask for, of every law that has several. Strengths stand first; of a wind that is a
+# drag, which nobody calls its strength.
+MAIN = {
+    "drag_power": "1/s", "bending_hysteresis": "1", "wind": "m/s", "attraction": "m/s^2", "tether": "N/m",
+    "obstacle": "m", "friction_power": "1", "friction_patch": "1", "bending_region": "1", "grip_slip": "1/N",
+    "rest_curvature": "1", "camera_scale": "1", "camera_rotation": "rad",
+}  # fmt: skip
+
+
+def test_a_cause_is_called_by_the_number_a_person_would_ask_for() -> None:
+    several = {e.id: e for e in LIBRARY.values() if len(e.parameters) > 1}
+    assert set(several) == set(MAIN), "a new law with several parameters: which one is said?"
+    for id, effect in several.items():
+        shown = next(q for q in effect.parameters if q.name == (effect.headline or effect.parameters[0].name))
+        assert shown.unit == MAIN[id]
+    assert all(e.headline in ("", *(q.name for q in e.parameters)) for e in LIBRARY.values())
+
+
+def test_a_wind_is_said_in_metres_a_second() -> None:
+    values = {
+        "coefficient": Value(0.491, "1/m", 0.4, 0.6), "velocity[0]": Value(3.02, "m/s", 2.0, 4.0),
+        "velocity[1]": Value(-0.5, "m/s", -1.0, 0.0), "along": Value(0.1, "1", 0.0, 0.2),
+    }  # fmt: skip
+    assert called(Cause("wind", "wind", 0.9, values)) == "wind: (3.02, -0.5) m/s"
+    slip = {"weakness": Value(10.1, "1/N", 4.8, 15.5), "damping": Value(5.0, "N s/m", 1.0, 9.0)}
+    assert called(Cause("grip_slip", "slip", 0.9, slip)) == "slip in the gripper: 10.1 1/N [4.8, 15.5]"
 
 
 def test_one_episode_gives_the_gain_no_interval(twin: Twin, dragged: list[Episode]) -> None:

@@ -147,6 +147,8 @@ class Effect:
     form: ClassVar[str] = ""
     end_twist: ClassVar[str] = ""  # the parameter [rad] by which a line's far material axes are turned in its gripper
 
+    headline: ClassVar[str] = ""  # the parameter that stands for the cause where one is shown; "": the first
+
     @classmethod
     def in_form(cls, p: Mapping[str, tuple[float, ...]], physics: Physics) -> dict[str, tuple[float, ...]]:
         """Parameters of the effect `form` that are the same law."""
