@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pred_core.config import from_mapping
 from pred_core.diagnose.config import DiagnoseConfig
+from pred_core.diagnose.effort import say_effort
 from pred_core.diagnose.fit import Target, fit
 from pred_core.diagnose.journal import Journal, vector
 from pred_core.diagnose.judge import Bench, Tell, scaled
@@ -68,6 +69,7 @@ def commission(
     use = np.array([s == "train" for s in judged_on.splits])
     if not use.any():  # a reference of test episodes alone
         use[:] = True
+    say_effort(Roller(twin, sample), config, tell)
     _check(Roller(twin, judged_on), judged_on, twin)
     given = twin
     twin = journal.piece(

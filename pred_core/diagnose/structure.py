@@ -18,6 +18,7 @@ from pred_core.diagnose.evidence import Judged, family_wise
 from pred_core.diagnose.fit import Target
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import JACKKNIFE, Bench, Tell
+from pred_core.diagnose.pace import Pace
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.trial import Trial, make_trial
 from pred_core.effects import find_effect
@@ -74,11 +75,11 @@ def question(bench: Bench, journal: Journal, tell: Tell) -> tuple[Bench, Judged,
     found like any other cause.
     """
     before = bench.standing()
-    best = _asked(bench, (), journal, "structure")
+    best = _asked(bench, (), journal, "structure", tell)
     tell(f"bending by angle: gain {best.judged.mean:.3f} of {before.mean():.3f}")
     least = bench.config.cold_gate * float(before.mean())
     if best.judged.mean < least:
-        best = _asked(bench, (COMPANION,), journal, "structure/damped")
+        best = _asked(bench, (COMPANION,), journal, "structure/damped", tell)
         tell(f"bending by angle, with damping: gain {best.judged.mean:.3f} of {before.mean():.3f}")
     p = float(family_wise([best.judged], bench.config.seed)[0])
     if p > bench.config.level or best.judged.mean < least:
@@ -103,19 +104,24 @@ class _Asked:
     judged: Judged
 
 
-def _asked(bench: Bench, beside: tuple[type[Effect], ...], journal: Journal, key: str) -> _Asked:
+def _asked(bench: Bench, beside: tuple[type[Effect], ...], journal: Journal, key: str, tell: Tell) -> _Asked:
     """Fit the chain, with effects `beside` it, on the train episodes; judge it by parameters of other recordings."""
     fitted, target = bench.fitted, bench.target
     slim = _with(chain(bench.twin), beside)
+    with_damping = " with damping" if beside else ""
 
     def fit_chain() -> dict[str, object]:
+        tell(f"bending by angle{with_damping}: a coarse grid, then a fit without each recording")
         twin = refined(_first(slim, beside, fitted), fitted, None, beside=beside)
         rows = []
         groups = fitted.roller.sample.groups
-        for group in sorted(set(groups.tolist())):
+        every = sorted(set(groups.tolist()))
+        pace = Pace(len(every), journal)
+        for n, group in enumerate(every, 1):
             keep = np.flatnonzero(groups != group).tolist()
             own = refined(twin, fitted.part(keep), None, steps=1, beside=beside) if keep else twin
             rows.append([int(group), values_of(own)])
+            tell(f"bending by angle{with_damping}: fitted without {n}/{len(every)} recordings{pace.left(n)}")
         return {"twin": values_of(twin), "without": rows}
 
     def read(stored: dict[str, Any]) -> tuple[Twin, dict[int, Twin]]:
