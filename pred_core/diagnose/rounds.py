@@ -72,7 +72,8 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
         key = f"{number}/screen/{'+'.join(e.id for e in effects)}"
         screened.append(screen(bench, effects, rng_of(config.seed, key), progress.journal, key))
         if n % 8 == 0:
-            tell(f"round {number + 1}: screening {n + 1}/{len(options)}{pace.left(n + 1)}")
+            left = pace.left(n + 1) if n else ""  # the first ones are the cheapest
+            tell(f"round {number + 1}: screening {n + 1}/{len(options)}{left}")
     screened.sort(key=lambda s: -s.promise)
     tell("round {}: most promising: {}".format(number + 1, ", ".join(s.trial.id for s in screened[:4])))
     worth = WORTH * (floor or float(base.mean()))
