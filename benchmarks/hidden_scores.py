@@ -226,6 +226,8 @@ def parameter_error(
     if same.reads == "lean":
         lean = math.degrees(math.atan2(math.hypot(numbers[0], numbers[1]), GRAVITY - numbers[2]))
         return abs(lean - truth) / abs(truth), None
+    if values[0]["low"] is None:  # nobody measured an interval
+        return abs(float(numbers[0]) - truth) / abs(truth), None
     low, high = sorted((values[0]["low"], values[0]["high"]))
     return abs(float(numbers[0]) - truth) / abs(truth), bool(low <= truth <= high)
 

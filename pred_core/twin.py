@@ -28,10 +28,11 @@ from torch import Tensor
 
 from pred_core.calibration import Calibration, calibration_to_mapping, calibration_values
 from pred_core.config import from_mapping, load_yaml, setting, to_mapping
-from pred_core.errors import TwinError
+from pred_core.errors import TwinError, nearest
 from pred_core.types import Body, Box, Capsule, Fixture, ObjectInfo, Physics, Scene, Sphere
 
 FORMAT = 1
+ENTRY = ("id", "version", "parameters", "evidence")  # keys of an entry of extensions.yaml; the last may be left out
 _FIXTURES: dict[str, type] = {"box": Box, "capsule": Capsule, "sphere": Sphere}
 
 
@@ -43,6 +44,7 @@ class Extension:
     version: int
     parameters: Mapping[str, tuple[float, ...]]  # scalars are 1-tuples
     evidence: Mapping[str, Any] = field(default_factory=dict)  # how it was found; read by people
+    source: str = field(default="", compare=False, repr=False)  # the file it was read from, which a message names
 
 
 @dataclass(frozen=True)
@@ -209,18 +211,33 @@ def _load_extensions(path: Path) -> tuple[Extension, ...]:
     if not path.is_file():
         return ()
     entries = load_yaml(path) or []
+    if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
+        raise TwinError(f"{path}: not a list of entries", allowed=f"each with {', '.join(ENTRY)}")
     try:
-        return tuple(
-            Extension(
-                id=str(e["id"]),
-                version=int(e["version"]),
-                parameters={k: tuple(float(x) for x in v) for k, v in e["parameters"].items()},
-                evidence=e.get("evidence", {}),
-            )
-            for e in entries
-        )
-    except (TypeError, KeyError, ValueError, AttributeError) as error:
-        raise TwinError(f"{path}: malformed entry", got=error, allowed="id, version, parameters, evidence") from error
+        return tuple(_extension(e, f"{path}: entry {n}", str(path)) for n, e in enumerate(entries, 1))
+    except (TypeError, KeyError, AttributeError) as error:
+        raise TwinError(f"{path}: malformed entry", got=error, allowed=", ".join(ENTRY)) from error
+
+
+def _extension(entry: Mapping[str, Any], where: str, file: str) -> Extension:
+    """One entry, strictly; whether the effect exists and its values fit is for the effects to say (`effect_of`)."""
+    for key in entry:
+        if key not in ENTRY:
+            raise TwinError(f"{where}: unknown key '{key}'", next_step=nearest(str(key), ENTRY))
+    for key in ENTRY[:3]:
+        if key not in entry:
+            raise TwinError(f"{where}: missing key '{key}'", allowed=", ".join(ENTRY))
+    id, version = entry["id"], entry["version"]
+    if not isinstance(id, str):
+        raise TwinError(f"{where}: id", got=repr(id), allowed="the name of an effect")
+    if type(version) is not int:
+        raise TwinError(f"{where}: version", got=repr(version), allowed="a whole number")
+    parameters = {}
+    for name, values in entry["parameters"].items():
+        if not isinstance(values, list) or not all(type(v) in (int, float) for v in values):
+            raise TwinError(f"{where}: '{name}' of {id}", got=repr(values), allowed="a list of numbers, such as [0.5]")
+        parameters[name] = tuple(float(v) for v in values)
+    return Extension(id, version, parameters, entry.get("evidence") or {}, file)
 
 
 def _load_calibration(path: Path) -> Calibration:

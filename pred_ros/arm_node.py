@@ -28,6 +28,7 @@ from pred_core.arm.follower import Follower
 from pred_core.arm.guard import Guard, Mode
 from pred_core.arm.limits import GuardConfig, bounds_of
 from pred_core.arm.placement import Placement
+from pred_core.arm.plan_needs import LIFETIME
 from pred_core.arm.plant import HOST, PATIENCE, PORT, STARTING, connect_plant
 from pred_core.arm.protocol import Arm, Reading
 from pred_core.arm.step_check import StepCheck
@@ -53,7 +54,7 @@ class ArmConfig(GuardConfig):
     host: str = setting("", doc="address of the arm's controller; of a plant, this machine unless told otherwise")
     port: int = setting(PORT, low=1, high=65535, doc="of a plant's controller")
     source: str = setting("plan", choices=("plan", "command"), doc="follow plan/trajectory or gripper/command")
-    lifetime: float = setting(3.0, unit="s", low=0.1, high=600.0, doc="age at which a plan is followed no more")
+    lifetime: float = setting(LIFETIME, unit="s", low=0.1, high=600.0, doc="age at which a plan is followed no more")
     base_x: float = setting(0.0, unit="m", low=-5.0, high=5.0, doc="the arm's base in world")
     base_y: float = setting(0.0, unit="m", low=-5.0, high=5.0, doc="the arm's base in world")
     base_z: float = setting(0.0, unit="m", low=-5.0, high=5.0, doc="the arm's base in world")

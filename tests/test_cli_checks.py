@@ -44,3 +44,26 @@ def test_shipped_twins_load_with_base_residual_and_what_is_held(name: str) -> No
     assert twin.residual is not None and twin.base is not None and twin.base.residual is None
     assert {e.id for e in twin.extensions} > {e.id for e in twin.base.extensions}
     assert not any(c.startswith("/") for c in twin.meta.created_by.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["diagnose", "data", "--twin", "t", "--out", "o", "--secnods", "3"], "'--secnods'. did you mean '--seconds'?"),
+        (["diagnose", "data", "--twni", "t"], "'--twni'. did you mean '--twin'?"),  # though --out is missing
+        (["evaluate", "data", "--twni=t", "--out", "o"], "'--twni'. did you mean '--twin'?"),
+        (["plant", "rope", "--efect", "gust"], "'--efect'. did you mean '--effect'?"),
+    ],
+)
+def test_an_option_that_no_command_has(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    assert capsys.readouterr().err.strip() == f"pred: unknown option {said}"
+
+
+@pytest.mark.parametrize("words", [["--no-settle"], ["--sec", "3"], ["--seconds=3"]])
+def test_an_option_that_there_is_passes(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Switched off, cut short, or with its value: the next thing that is wrong is told."""
+    assert main(["diagnose", str(tmp_path / "none"), "--twin", "t", "--out", "o", *words]) == 2
+    assert "not a data set" in capsys.readouterr().err

@@ -59,7 +59,7 @@ def test_the_answer_has_what_the_design_says(found: Path) -> None:
     assert d["error_mm_ood"] == {}
     gain = d["gain"]
     assert gain["mean_mm"] == pytest.approx(error["base"] - error["extended"])
-    assert gain["low_mm"] <= gain["mean_mm"] <= gain["high_mm"]
+    assert gain["low_mm"] is None and gain["high_mm"] is None  # one test episode
     assert gain["episodes_improved"] == "1/1" and 0.0 < gain["p_adjusted"] <= 1.0
     budget = d["budget"]
     assert set(budget) == {"named", "learned", "unexplained", "floor"} and budget["learned"] == 0.0
@@ -86,8 +86,9 @@ def test_one_train_episode_is_exploratory(world: Path, tmp_path: Path, dragged: 
     d = read(tmp_path / "out")
     assert d["exploratory"] is True and d["sentence"].startswith("Exploratory")
     assert any("exploratory" in note for note in d["notes"])
-    for cause in d["causes"]:  # one recording has no scatter: no interval narrower than what is allowed
-        assert all(v["high"] - v["low"] > abs(v["value"]) for v in cause["parameters"].values())
+    assert d["causes"]
+    for cause in d["causes"]:  # one recording has no scatter
+        assert all(v["low"] is None and v["high"] is None for v in cause["parameters"].values())
 
 
 def test_the_extended_twin_is_a_twin(found: Path, world: Path, dragged: list[Episode]) -> None:

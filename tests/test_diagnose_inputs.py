@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import pytest
 from diagnose_runs import SPLITS, diagnose, refusal, write
 from report_cases import drag, recorded, rope
 
+from pred_core.cli.main import main
+from pred_core.diagnose.out_folder import check_out
 from pred_core.types import Episode, Scene
 
 
@@ -61,6 +64,75 @@ def test_out_must_not_hold_a_twin_of_others(world: Path, tmp_path: Path, capsys:
     assert diagnose(world / "suspect", world / "twin", tmp_path) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "a twin that no diagnosis wrote" in line and "move that twin away" in line and tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["report.html", "diagnosis.json", "next_motion.yaml", "journal.jsonl"])
+def test_out_must_not_hold_results_of_others(
+    name: str, world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The report of `pred evaluate`, somebody's diagnosis.json or a diary stay; beside them an answer is refused."""
+    (tmp_path / "report.html").write_text("<h1>Evaluation</h1>")
+    (tmp_path / name).write_text('{"a": 1}\n')
+    before = tree(tmp_path)
+    assert diagnose(world / "suspect", world / "twin", tmp_path) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "report.html" in line and "that no diagnosis wrote there" in line and tree(tmp_path) == before
+    assert line.endswith("Give another --out, or move it away.")
+
+
+@pytest.mark.parametrize("ours", ["diagnosis.json", "journal.jsonl", "journal.old1.jsonl"])
+def test_what_a_diagnosis_left_is_taken_for_its_own(ours: str, tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text("<h1>Diagnosis</h1>")
+    rope().save(tmp_path / "twin")
+    text = {"outcome": "none", "sentence": "", "causes": []} if ours == "diagnosis.json" else {"header": {"data": []}}
+    (tmp_path / ours).write_text(json.dumps(text) + "\n")
+    check_out(tmp_path, tmp_path.parent / "elsewhere", {})
+
+
+@pytest.mark.parametrize("flags", [(), ("--guard",)])
+@pytest.mark.parametrize("deep", [False, True])
+def test_out_must_be_a_folder(
+    flags: tuple[str, ...], deep: bool, world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    out = tmp_path / "file" / "deeper" if deep else tmp_path / "file"
+    arguments = ["diagnose", str(world / "suspect"), "--twin", str(world / "twin"), "--out", str(out), *flags]
+    assert main(arguments) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "--out must be a folder" in line and f"got {tmp_path / 'file'}, which is a file" in line
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_one_recording_must_not_be_fitted_and_held_out(
+    world: Path, tmp_path: Path, dragged: list[Episode], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same bag under another name, as train and as test; in the reference too."""
+    data = write(tmp_path / "data", [*dragged[:5], dataclasses.replace(dragged[5], name="other")])
+    shutil.copy(data / "ep1.mcap", data / "other.mcap")
+    line = refusal(capsys, data, world / "twin", tmp_path / "out")
+    assert f"{data}: one recording is listed twice; got ep1.mcap (train) and other.mcap (test)" in line
+    assert line.endswith("Remove one of them from dataset.yaml.")
+    against = ("--reference", str(data))
+    assert "listed twice" in refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", *against)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[1]", "got list, not a mapping"),
+        ('{"test": 3}', "got split 'test' without 'base'"),
+        ('{"test": {"base": {"mean": 1.0, "low": 0.5}}}', "got 'base' of split 'test' without 'high'"),
+        ('{"test": {"base": {"mean": null, "low": 0.5, "high": 2}}}', "got None as 'mean' of 'base' of split 'test'"),
+        ("{", "cannot be read"),
+    ],
+)
+def test_a_network_file_that_is_none(
+    text: str, said: str, world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One line in words: what is missing, and what makes such a file."""
+    (tmp_path / "n.json").write_text(text)
+    line = refusal(capsys, world / "suspect", world / "twin", tmp_path / "out", "--network", str(tmp_path / "n.json"))
+    assert said in line and line.endswith("Make it with benchmarks/network_2x2.py.") and "Error" not in line
 
 
 @pytest.mark.parametrize(

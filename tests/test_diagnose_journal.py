@@ -11,11 +11,13 @@ import pytest
 from diagnose_cases import SMALL, SPLITS, quiet
 from report_cases import recorded, rope
 
-from pred_core.diagnose.commission import commission, values_of
+from pred_core.diagnose.commission import commission, values_of, with_stored
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import judge, quick, screen
+from pred_core.diagnose.structure import COMPANION, applies, chain, question
+from pred_core.diagnose.structure import _with as with_effects
 from pred_core.effects import find_effect
-from pred_core.errors import ConfigError
+from pred_core.errors import ConfigError, TwinError
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
@@ -98,7 +100,8 @@ def test_a_damaged_journal_is_refused(tmp_path: Path, line: str) -> None:
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("base", 3), ("base", {"physics": {"stiffness": "soft"}, "extensions": []}), ("x/screen", []),
+    [("base", 3), ("base", {"physics": {"stiffness": "soft"}, "extensions": []}),
+     ("base", {"physics": {"stiffness": 20.0}, "extensions": []}), ("x/screen", []),
      ("x/screen", [[[0.1, 0.2], 1.0]]), ("x/quick", [[None], 1.0]), ("x/fit", {"z": [1.0]}),
      ("x/fit", {"z": [1.0], "null": [0.0], "left_out": [[1.0]], "gain": [1.0], "moved": [1.0], "extended": [1.0]}),
      ("x/fit", TWO), ("x/fit", {**TWO, "excited": "many"})],
@@ -118,4 +121,44 @@ def test_a_value_that_no_diagnosis_wrote_is_refused(
         found = screen(bench, (find_effect("drag_linear"),), np.random.default_rng(0), journal, "x/screen")
         quick(bench, found, journal, "x/quick")
         judge(bench, found, journal, "x/fit")
+    assert "\n" not in str(refused.value)
+
+
+def test_values_that_no_parameter_may_have_are_refused(twin: Twin) -> None:
+    """Whole and finite, but a negative stiffness, or a drag beyond what the effect declares: with the range."""
+    extended = twin.replace(extensions=(find_effect("drag_linear").extension(coefficient=1.0),))
+    good = values_of(extended)
+    assert with_stored(twin.replace(extensions=extended.extensions), good).physics == twin.physics
+    with pytest.raises(ConfigError, match="physics: stiffness; got -20"):
+        with_stored(extended, {**good, "physics": {**good["physics"], "stiffness": -20.0}})
+    with pytest.raises(TwinError, match="'drag_linear': 'coefficient'; got -1"):
+        with_stored(extended, {**good, "extensions": [{"coefficient": [-1.0]}]})
+
+
+@pytest.mark.parametrize("key", ["structure", "structure/damped"])
+@pytest.mark.parametrize("value", ["empty", "a recording too few", "softer than nothing", "a list"])
+def test_a_damaged_answer_about_bending_is_refused(
+    twin: Twin, reference: list[Episode], tmp_path: Path, key: str, value: str
+) -> None:
+    """The chain as it is saves nothing here, so that the chain with damping is asked for too."""
+    path = tmp_path / "journal.jsonl"
+    bench = commission(twin, reference[:3], (), SMALL, quiet, Journal(None, {}))
+    assert applies(bench.twin)
+    pieces = {}
+    for name, effects in (("structure", ()), ("structure/damped", (COMPANION,))):
+        whole = values_of(with_effects(chain(bench.twin), effects))
+        pieces[name] = {"twin": whole, "without": [[int(g), whole] for g in bench.fitted.roller.sample.groups]}
+    whole = pieces[key]["twin"]
+    soft = {**whole, "physics": {**whole["physics"], "bending_stiffness": -1.0}}
+    pieces[key] = {
+        "empty": {"twin": {}, "without": []},
+        "a recording too few": {**pieces[key], "without": pieces[key]["without"][1:]},
+        "softer than nothing": {**pieces[key], "twin": soft},
+        "a list": [],
+    }[value]
+    first = Journal(path, {})
+    for name, piece in pieces.items():
+        first.once(name, lambda piece=piece: piece)
+    with pytest.raises(ConfigError, match=f"journal.jsonl: the value of '{key}' is damaged.*Delete") as refused:
+        question(bench, Journal(path, {}), quiet)
     assert "\n" not in str(refused.value)

@@ -14,9 +14,11 @@ from report_cases import LINEAR, NOISE, PERIOD, answer, drag, recorded, rope
 
 from pred_core.arm.limits import GuardConfig
 from pred_core.arm.plan_file import load_plan
+from pred_core.arm.plan_needs import as_parameters, needs_of
+from pred_core.config import load_yaml
 from pred_core.diagnose.apart import Rolled, separation
 from pred_core.diagnose.motion_file import write_motion
-from pred_core.diagnose.motions import LONGEST, Limits, library, limits_of
+from pred_core.diagnose.motions import FAST, LONGEST, Limits, library, limits_of
 from pred_core.diagnose.next_motion import compare, propose, rivals_of
 from pred_core.errors import ConfigError, InputError
 from pred_core.frames import quaternion_from_rotation_vector
@@ -173,6 +175,20 @@ def test_rivals_are_the_group_then_the_runner_up_then_the_ends_of_a_wide_interva
     assert rivals_of(answer(twin, dragged, "none")) is None
 
 
+def test_what_a_plan_needs_of_an_arm() -> None:
+    """1 m/s for a tenth of a second from rest to rest, in steps of 0.05 s: 1 m/s / 0.05 s = 20 m/s^2 at either end. A
+    quarter turn in 0.1 s is 15.71 rad/s, rounded up."""
+    times, half = np.array([0.0, 0.05, 0.1, 0.15]), np.sqrt(0.5)
+    position = np.array([[0.0, 0, 0], [0.05, 0, 0], [0.1, 0, 0], [0.1, 0, 0]])
+    turned = [np.cos(np.pi / 8), 0.0, 0.0, np.sin(np.pi / 8)]
+    rotation = np.array([[1.0, 0, 0, 0], turned, [half, 0, 0, half], [half, 0, 0, half]])
+    needs = needs_of(times, position, rotation)
+    assert (needs["speed"], needs["acceleration"], needs["lifetime"]) == (1.0, 20.0, 1.15)
+    assert (needs["angular_speed"], needs["angular_acceleration"]) == (15.71, 314.16)
+    said = as_parameters(needs, GuardConfig())
+    assert said == "-p speed:=1 -p acceleration:=20 -p angular_speed:=15.71 -p angular_acceleration:=314.16"
+
+
 def test_nothing_is_proposed_for_a_gripper_that_stood_still(twin: Twin) -> None:
     """There is no box to move in and no speed that was shown."""
     still = recorded(twin, drag(), SPLITS, size=0.0)
@@ -180,7 +196,7 @@ def test_nothing_is_proposed_for_a_gripper_that_stood_still(twin: Twin) -> None:
 
 
 def test_an_arm_takes_the_plan_from_the_file(twin: Twin, dragged: list[Episode], tmp_path: Path) -> None:
-    """At the speed that was shown; it is refused whole by an arm that may only creep."""
+    """At the speed that was shown; it is refused whole by an arm that may only creep, which is told what it needs."""
     d = answer(twin, dragged, "group")
     motion = propose(d, dragged)
     assert motion is not None
@@ -194,8 +210,16 @@ def test_an_arm_takes_the_plan_from_the_file(twin: Twin, dragged: list[Episode],
     assert plan.end == pytest.approx(plan.begin + 1e9 * LONGEST, abs=2e8)
     e = next(e for e in dragged if e.name == motion["start"]["episode"])
     assert plan.position[0] == pytest.approx(e.grips.position[motion["start"]["frame"], 0].numpy(), abs=1e-6)
-    with pytest.raises(InputError, match="jumps"):
-        load_plan(tmp_path / "next_motion.yaml", 0, GuardConfig(speed=0.001))
+    with pytest.raises(InputError, match="too fast for this arm's guard; got .*allowed: 0.001 m/s") as refused:
+        load_plan(tmp_path / "next_motion.yaml", 0, dataclasses.replace(allowed, speed=0.001))
+    written = load_yaml(tmp_path / "next_motion.yaml")["arm"]
+    assert f"-p speed:={written['speed']:g}" in str(refused.value)
+    assert 0.9 * FAST * bound["speed"] < written["speed"] <= bound["speed"] + 0.01
+    assert written["acceleration"] <= 1.1 * bound["acceleration"] + 0.01
+    given = {k: max(v, getattr(GuardConfig(), k)) for k, v in written.items() if k != "lifetime"}
+    enough = dataclasses.replace(allowed, **given)
+    assert load_plan(tmp_path / "next_motion.yaml", 0, enough).times[-1] < written["lifetime"]
+    assert as_parameters(written, enough) == f"-p lifetime:={written['lifetime']:g}"
     (tmp_path / "other.yaml").write_text("trajectory: {points: [1]}\n")
     with pytest.raises(ConfigError, match="not a motion"):
         load_plan(tmp_path / "other.yaml", 0, allowed)

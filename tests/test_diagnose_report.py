@@ -17,7 +17,7 @@ from pred_core.diagnose.errors import episode_errors, gain_of
 from pred_core.diagnose.gate import GateCause
 from pred_core.diagnose.map import FEATURES, Replay, conditional, edges_of, from_above, grid_of, replay
 from pred_core.diagnose.next_motion import propose
-from pred_core.diagnose.pictures import whole_of
+from pred_core.diagnose.pictures import evidence, whole_of
 from pred_core.diagnose.report import with_clock, write_report
 from pred_core.diagnose.report_parts import budget_rows, span_of
 from pred_core.diagnose.result import Cause, Diagnosis, Errors
@@ -157,6 +157,19 @@ def test_a_report_of_one_episode_is_written(twin: Twin, tmp_path: Path) -> None:
     write_report(tmp_path / "report.html", d, episodes, None, "pred diagnose")
     text = (tmp_path / "report.html").read_text("utf-8")
     assert "One episode: no interval." in text and all(f"<h2>{s}" in text for s in SECTIONS if "{" not in s)
+
+
+@pytest.mark.parametrize("floor", [0.2, 1.99])
+def test_the_label_of_the_evidence_fits_the_figure(twin: Twin, dragged: list[Episode], floor: float) -> None:
+    """Also where the excess is next to nothing, which takes more words, beside long names."""
+    seen = dataclasses.replace(answer(twin, dragged).rounds[0], floor=floor)
+    longest = "friction that grows with another power of the speed"
+    words = dict.fromkeys((j.trial.id for j, _, _ in seen.judged), longest)
+    figure = evidence(seen, words, None, 0)
+    figure.draw_without_rendering()
+    label, whole = figure.axes[0].xaxis.label.get_window_extent(), figure.bbox
+    assert whole.x0 <= label.x0 and label.x1 <= whole.x1 and whole.y0 <= label.y0
+    assert ("next to nothing" in figure.axes[0].get_xlabel()) == (floor > 1.9)
 
 
 def test_a_change_of_structure_is_told_though_no_round_tried_it(

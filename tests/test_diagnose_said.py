@@ -15,7 +15,7 @@ from report_cases import LINEAR, answer, drag, judged, recorded, rope, with_erro
 from pred_core.calibration import Calibration
 from pred_core.diagnose.answer import CHEAP, Study, closed_by_gate, explained_by, floor_of, outcome_of, refining_of
 from pred_core.diagnose.answer import answer as answer_of
-from pred_core.diagnose.causes import causes_of
+from pred_core.diagnose.causes import causes_of, evidence_of
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.errors import episode_errors
 from pred_core.diagnose.gate import GateCause, GateResult
@@ -23,8 +23,8 @@ from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.ranking import UNSEEN, nothing, ranking
 from pred_core.diagnose.result import Cause, Diagnosis, Value
-from pred_core.diagnose.said import confusions, sentence, unproven, without_interval
-from pred_core.effects import find_effect
+from pred_core.diagnose.said import called, confusions, sentence, unproven, without_interval
+from pred_core.effects import LIBRARY, find_effect
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
@@ -115,15 +115,56 @@ def test_a_sensor_cause_was_not_judged_on_windows(twin: Twin, dragged: list[Epis
 def test_what_only_bounds_the_search_is_called_no_interval(
     twin: Twin, dragged: list[Episode], groups: Sequence[int], low: float, high: float, known: bool
 ) -> None:
-    """The search for drag goes from 0 to 50 /s. `diagnosis.json` keeps its numbers and a note says what they are."""
-    causes = causes_of(gate_of(), progress_of(groups, drag_named(twin, low, high)), {"drag_linear": 0.9}, {})
+    """The search for drag goes from 0 to 50 /s. `diagnosis.json` has null, and a note says so."""
+    progress = progress_of(groups, drag_named(twin, low, high))
+    causes = causes_of(gate_of(), progress, {"drag_linear": 0.9}, {})
     value = causes[0].parameters["coefficient"]
     assert (value.low, value.high, value.interval) == (low, high, known)
     d = dataclasses.replace(answer(twin, dragged), causes=causes)
     assert ("1.5 1/s (no interval)" in sentence(d)) == (not known)
     assert ("1.5 1/s [1.2, 1.8]" in sentence(d)) == known
     assert ("no interval for air drag (coefficient)" in without_interval(causes)) == (not known)
-    assert d.to_json()["causes"][0]["parameters"]["coefficient"]["high"] == high
+    told = d.to_json()["causes"][0]["parameters"]["coefficient"]
+    assert (told["low"], told["high"]) == ((low, high) if known else (None, None))
+    kept = evidence_of(drag()[0], progress).evidence["interval"]["drag_linear.coefficient[0]"]
+    assert kept == ([low, high] if known else None)
+
+
+# The parameter that a person would ask for, of every law that has several. Strengths stand first; of a wind that is a
+# drag, which nobody calls its strength.
+MAIN = {
+    "drag_power": "1/s", "bending_hysteresis": "1", "wind": "m/s", "attraction": "m/s^2", "tether": "N/m",
+    "obstacle": "m", "friction_power": "1", "friction_patch": "1", "bending_region": "1", "grip_slip": "1/N",
+    "rest_curvature": "1", "camera_scale": "1", "camera_rotation": "rad",
+}  # fmt: skip
+
+
+def test_a_cause_is_called_by_the_number_a_person_would_ask_for() -> None:
+    several = {e.id: e for e in LIBRARY.values() if len(e.parameters) > 1}
+    assert set(several) == set(MAIN), "a new law with several parameters: which one is said?"
+    for id, effect in several.items():
+        shown = next(q for q in effect.parameters if q.name == (effect.headline or effect.parameters[0].name))
+        assert shown.unit == MAIN[id]
+    assert all(e.headline in ("", *(q.name for q in e.parameters)) for e in LIBRARY.values())
+
+
+def test_a_wind_is_said_in_metres_a_second() -> None:
+    values = {
+        "coefficient": Value(0.491, "1/m", 0.4, 0.6), "velocity[0]": Value(3.02, "m/s", 2.0, 4.0),
+        "velocity[1]": Value(-0.5, "m/s", -1.0, 0.0), "along": Value(0.1, "1", 0.0, 0.2),
+    }  # fmt: skip
+    assert called(Cause("wind", "wind", 0.9, values)) == "wind: (3.02, -0.5) m/s"
+    slip = {"weakness": Value(10.1, "1/N", 4.8, 15.5), "damping": Value(5.0, "N s/m", 1.0, 9.0)}
+    assert called(Cause("grip_slip", "slip", 0.9, slip)) == "slip in the gripper: 10.1 1/N [4.8, 15.5]"
+
+
+def test_one_episode_gives_the_gain_no_interval(twin: Twin, dragged: list[Episode]) -> None:
+    """No 95 % interval of width 0; with two episodes it has one."""
+    for count, known in ((1, False), (2, True)):
+        d = with_error(answer(twin, dragged), (12.0, 14.0)[:count], (8.0, 9.0)[:count])
+        gain = d.to_json()["gain"]
+        assert (gain["low_mm"] is not None) == (gain["high_mm"] is not None) == known
+        assert gain["mean_mm"] == pytest.approx(4.0 if count == 1 else 4.5)
 
 
 def test_a_correction_closes_what_it_takes_away(twin: Twin, dragged: list[Episode]) -> None:

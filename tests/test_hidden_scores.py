@@ -103,6 +103,8 @@ def test_parameter_errors_in_the_librarys_units(bench: dict[str, ModuleType]) ->
 
     assert error(("drag_linear", 1.0), "drag_linear", coefficient=(0.9, 0.7, 0.95)) == (pytest.approx(0.1), False)
     assert error(("action_delay", 40.0), "delay", delay=(0.042, 0.03, 0.05)) == (pytest.approx(0.05), True)
+    unmeasured: Any = (0.9, None, None)  # null in diagnosis.json: nobody measured an interval
+    assert error(("drag_linear", 1.0), "drag_linear", coefficient=unmeasured) == (pytest.approx(0.1), None)
     # The library's ball holds the rope's 4 mm: a hidden one of 46 mm is one of 50 mm there.
     assert error(("obstacle", 0.046), "obstacle", radius=(0.055, 0.05, 0.06)) == (pytest.approx(0.1), True)
     # (3, 4) m/s is a wind of 5 m/s; the interval of a component says nothing of the length.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pred_core.arm.limits import GuardConfig, bounds_of
+from pred_core.arm.limits import GuardConfig, workspace_of
 from pred_core.arm.orientation import Quaternion, angle_between, slerp
 from pred_core.errors import InputError
 
@@ -177,14 +177,14 @@ class Follower:
 
 
 def _check_place(plan: Plan, config: GuardConfig) -> None:
-    bounds = bounds_of(config)
-    out = np.maximum(bounds.low - plan.position, plan.position - bounds.high).max(axis=1)
+    low, high = workspace_of(config)
+    out = np.maximum(low - plan.position, plan.position - high).max(axis=1)
     k = int(out.argmax())
     if out[k] > OUTSIDE:
         raise InputError(
             f"plan leaves the workspace at point {k}",
             got=f"{np.round(plan.position[k], 4).tolist()} m, {1e3 * out[k]:.0f} mm outside",
-            allowed=f"{bounds.low.tolist()} to {bounds.high.tolist()} m",
+            allowed=f"{low.tolist()} to {high.tolist()} m",
             next_step="Plan inside the arm's workspace, or set its x_low to z_high",
         )
 

@@ -77,14 +77,20 @@ class Bounds:
         return speed * self.lag
 
 
-def bounds_of(config: GuardConfig) -> Bounds:
-    """Raises: ConfigError for an empty box, or limits that cannot hold together."""
+def workspace_of(config: GuardConfig) -> tuple[Array, Array]:
+    """Corners (3,) [m] of the tool centre's box, above the table. Raises: ConfigError for an empty one."""
     low = np.array([config.x_low, config.y_low, max(config.z_low, config.table + config.clearance)])
     high = np.array([config.x_high, config.y_high, config.z_high])
     if not (low < high).all():
         raise ConfigError(
             "the workspace box is empty", got=f"{low.tolist()} to {high.tolist()} m", allowed="low below high"
         )
+    return low, high
+
+
+def bounds_of(config: GuardConfig) -> Bounds:
+    """Raises: ConfigError for an empty box, or limits that cannot hold together."""
+    low, high = workspace_of(config)
     if config.fault_after <= config.ramp_after:
         raise ConfigError(
             "fault_after", got=f"{config.fault_after} s", allowed=f"more than ramp_after {config.ramp_after} s"

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pred_core.arm.approach import TimedPoses
-from pred_core.arm.follower import Plan, make_plan
+from pred_core.arm.follower import OVER, Plan, make_plan
 from pred_core.arm.limits import GuardConfig
+from pred_core.arm.plan_needs import as_parameters, needs_of
 from pred_core.config import load_yaml
-from pred_core.errors import ConfigError
+from pred_core.errors import ConfigError, InputError
 
 
 def read_motion(path: Path, gripper: int = 0) -> tuple[str, TimedPoses, float]:
@@ -40,7 +43,19 @@ def read_motion(path: Path, gripper: int = 0) -> tuple[str, TimedPoses, float]:
 def load_plan(path: Path, start: int, config: GuardConfig, gripper: int = 0) -> Plan:
     """The motion of one gripper, beginning at `start` [ns]. The arm must be at its first pose by then.
 
-    Raises: ConfigError if the file has another layout, InputError for a plan that cannot be followed within `config`.
+    Raises: ConfigError if the file has another layout, InputError for a plan that cannot be followed within `config`,
+    with the parameters the arm needs for it.
     """
     frame, motion, _ = read_motion(path, gripper)
-    return make_plan(start, frame, motion.times.tolist(), motion.position, motion.rotation, config)
+    anything = dataclasses.replace(config, speed=math.inf, angular_speed=math.inf)
+    moments, position, rotation = motion.times.tolist(), motion.position, motion.rotation
+    plan = make_plan(start, frame, moments, position, rotation, anything)  # all but its speeds, asked for here
+    needs = needs_of(plan.times, plan.position, plan.rotation)
+    if needs["speed"] > OVER * config.speed or needs["angular_speed"] > OVER * config.angular_speed:
+        raise InputError(
+            f"{path}: is too fast for this arm's guard",
+            got=f"{needs['speed']:g} m/s and {needs['angular_speed']:g} rad/s",
+            allowed=f"{config.speed:g} m/s and {config.angular_speed:g} rad/s",
+            next_step=f"Where it is safe, give the arm node {as_parameters(needs, config)}",
+        )
+    return plan

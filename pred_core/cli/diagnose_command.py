@@ -18,7 +18,7 @@ from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.fits import check_tracks
 from pred_core.diagnose.job import check_gravity, differences, job_of
 from pred_core.diagnose.journal import Journal
-from pred_core.diagnose.motion_file import write_motion
+from pred_core.diagnose.motion_file import for_the_arm, write_motion
 from pred_core.diagnose.out_folder import (
     JOURNAL,
     TWIN,
@@ -128,7 +128,9 @@ def _write_next_motion(path: Path, answer: Diagnosis) -> None:
         path.unlink(missing_ok=True)
     else:
         write_motion(path, answer.next_motion)
-        print(f"to tell more, record: {answer.next_motion['name']} ({path})")
+        needs = for_the_arm(answer.next_motion)
+        told = f"; the arm node needs {needs} for it, where that is safe" if needs else ""
+        print(f"to tell more, record: {answer.next_motion['name']} ({path}{told})")
 
 
 def _journal(

@@ -29,7 +29,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if name is not None and name not in COMMANDS:
             raise PredError(f"unknown command '{name}'", next_step=nearest(name, COMMANDS))
         chosen = COMMANDS if name is None else (name,)
-        args = _parser({c: _module(c) for c in chosen}).parse_args(arguments)
+        parser = _parser({c: _module(c) for c in chosen})
+        _check_options(arguments, parser)
+        args = parser.parse_args(arguments)
         return int(args.run(args))
     except PredError as error:
         print(f"pred: {error}", file=sys.stderr)
@@ -55,6 +57,26 @@ def _parser(modules: dict[str, ModuleType]) -> argparse.ArgumentParser:
         module.configure(sub)
         sub.set_defaults(run=module.run)
     return parser
+
+
+def _check_options(arguments: Sequence[str], parser: argparse.ArgumentParser) -> None:
+    """Raise PredError with the nearest name for an option that no command at hand has; argparse names only the word."""
+    known = _options(parser)
+    for word in arguments:
+        if word == "--":
+            return
+        option = word.split("=", 1)[0]
+        if word.startswith("--") and not any(o.startswith(option) for o in known):  # it may be cut short
+            raise PredError(f"unknown option '{option}'", next_step=nearest(option, known))
+
+
+def _options(parser: argparse.ArgumentParser) -> set[str]:
+    """Every long option of a parser and of the commands in it."""
+    found = {o for o in parser._option_string_actions if o.startswith("--")}
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            found = found.union(*map(_options, action.choices.values()))
+    return found
 
 
 if __name__ == "__main__":

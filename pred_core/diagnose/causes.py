@@ -11,6 +11,7 @@ from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.result import Cause, Value
 from pred_core.diagnose.structure import FAMILY, ID
 from pred_core.effects import LIBRARY, find_effect
+from pred_core.identify.space import Knob
 from pred_core.twin import Extension
 
 
@@ -60,10 +61,15 @@ def _named(n: Named, probability: Mapping[str, float], single: bool) -> list[Cau
             low, high = j.intervals[knob.name]
             values[name if size > 1 else plain] = Value(
                 j.values[knob.name], knob.unit, low, high, j.at_bound[knob.name],
-                interval=not single and (low, high) != (knob.low, knob.high),
+                interval=not single and _measured(knob, (low, high)),
             )  # fmt: skip
         rows.append(Cause(id, effect.family, sure, values, False, n.closed, n.p_adjusted, n.group, n.contradicted))
     return rows
+
+
+def _measured(knob: Knob, span: tuple[float, float]) -> bool:
+    """Whether an interval is narrower than the search."""
+    return span != (knob.low, knob.high)
 
 
 def _gate_values(cause: GateCause) -> dict[str, Value]:
@@ -82,12 +88,18 @@ def evidence_of(extension: Extension, progress: Progress) -> Extension:
     for n in progress.named:
         if extension.id in n.judged.trial.ids:
             better, acting = n.judged.improved
+            known = not one_recording(progress.bench)
+            spans = {
+                k.name: list(n.judged.intervals[k.name]) if known and _measured(k, n.judged.intervals[k.name]) else None
+                for k in n.judged.trial.space.knobs
+                if k.name.startswith(f"{extension.id}.")
+            }  # None: nobody measured one
             evidence = {
                 "found_by": "pred diagnose",
                 "p_adjusted": n.p_adjusted,
                 "closed": n.closed,
                 "episodes_improved": f"{better}/{acting}",
-                "interval": {k: list(v) for k, v in n.judged.intervals.items() if k.startswith(f"{extension.id}.")},
+                "interval": spans,
                 "group": list(n.group),
             }
             return dataclasses.replace(extension, evidence=evidence)

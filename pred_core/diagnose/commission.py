@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pred_core.config import from_mapping
 from pred_core.diagnose.config import DiagnoseConfig
+from pred_core.diagnose.effort import say_effort
 from pred_core.diagnose.fit import Target, fit
 from pred_core.diagnose.journal import Journal, vector
 from pred_core.diagnose.judge import Bench, Tell, scaled
@@ -18,7 +20,7 @@ from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.sample import Sample, make_sample
 from pred_core.diagnose.trial import make_trial
 from pred_core.diagnose.weigh import Weights, misfit_of, seen_of, weigh
-from pred_core.effects import find_effect
+from pred_core.effects import effect_of, find_effect
 from pred_core.effects.effect import Effect
 from pred_core.errors import ConfigError, DatasetError
 from pred_core.identify.space import Candidate
@@ -67,6 +69,7 @@ def commission(
     use = np.array([s == "train" for s in judged_on.splits])
     if not use.any():  # a reference of test episodes alone
         use[:] = True
+    say_effort(Roller(twin, sample), config, tell)
     _check(Roller(twin, judged_on), judged_on, twin)
     given = twin
     twin = journal.piece(
@@ -112,14 +115,18 @@ def values_of(twin: Twin) -> dict[str, Any]:
 
 
 def with_stored(twin: Twin, values: dict[str, Any]) -> Twin:
-    """The twin at stored values. Raises: KeyError, TypeError or ValueError if they are not of this twin."""
+    """The twin at stored values. Raises: KeyError, TypeError or ValueError if they are not of this twin, or lie outside
+    what their parameters allow."""
     extensions = tuple(
         dataclasses.replace(e, parameters={k: tuple(found[k]) for k in e.parameters})
         for e, found in zip(twin.extensions, values["extensions"], strict=True)
     )
     numbers = [*values["physics"].values(), *(v for e in extensions for row in e.parameters.values() for v in row)]
     vector(numbers, len(numbers))
-    return twin.replace(physics=Physics(**values["physics"]), extensions=extensions)
+    for e in extensions:
+        effect_of(e)
+    physics = {f.name: values["physics"][f.name] for f in dataclasses.fields(Physics)}  # all, none by its default
+    return twin.replace(physics=from_mapping(Physics, physics, "physics"), extensions=extensions)
 
 
 def _polish(twin: Twin, sample: Sample, use: NDArray[np.bool_], config: DiagnoseConfig, tell: Tell) -> Twin:

@@ -28,7 +28,10 @@ class DiagnoseConfig:
     places: int = setting(32, low=4, high=1000, doc="places, or the like, where a localized cause is tried first")
     iterations: int = setting(8, low=1, high=100, doc="steps of a refinement")
     causes: int = setting(3, low=1, high=8, doc="most causes that are named together")
-    seconds: float = setting(300.0, unit="s", low=1.0, high=86400.0, doc="time it aims at; the screening always ends")
+    seconds: float = setting(
+        300.0, unit="s", low=1.0, high=86400.0, doc="time it aims at: the first round always ends, none begins after "
+        "0.8 of it, nor one that would end after 1.25 of it, going by the last"
+    )  # fmt: skip
     settle: bool = setting(True, doc="windows start from an estimate over several frames; off: raw from two")
     back_fit: bool = setting(
         True, doc="no change is what the reference says of a candidate, or a base refined anew; off: the twin as it is"

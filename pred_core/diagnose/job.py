@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pred_core.bag.dataset import FILE, Dataset
+from pred_core.bag.dataset import FILE, Dataset, EpisodeEntry
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.errors import DatasetError, TwinError
 from pred_core.twin import Twin
@@ -24,10 +24,13 @@ _FALLBACK = "what it was asked cannot be read"
 def job_of(dataset: Dataset, reference: Dataset | None, twin: Twin, config: DiagnoseConfig) -> dict[str, Any]:
     """The header of the journal: the same job has the same, whatever its folders are called and how long it may take.
 
-    Raises: DatasetError if a bag of the reference is one of the data set's too, or cannot be read.
+    Raises: DatasetError if a data set has a recording under two names, if a bag of the reference is one of the data
+    set's too, or if one cannot be read.
     """
     sets = [dataset] if reference is None else [dataset, reference]
     hashes = [[s.sha256(e) for e in s.entries] for s in sets]
+    for one, mine in zip(sets, hashes, strict=True):
+        _check_twice(one, mine)
     if reference is not None:
         _check_shared(dataset, reference, hashes)
     facts = [repr((s.entries, s.held, s.gravity, s.known, s.sigma)) for s in sets]
@@ -84,6 +87,20 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
     if before["version"] != now["version"]:
         found.append("written by another version")
     return found
+
+
+def _check_twice(dataset: Dataset, hashes: list[str]) -> None:
+    """What is fitted cannot be held out too, and what counts twice makes every interval too narrow."""
+    first: dict[str, EpisodeEntry] = {}
+    for entry, hash in zip(dataset.entries, hashes, strict=True):
+        other = first.setdefault(hash, entry)
+        if other is not entry:
+            raise DatasetError(
+                f"{dataset.root}: one recording is listed twice",
+                got=f"{other.bag} ({other.split}) and {entry.bag} ({entry.split}) with the same content",
+                allowed="every recording once",
+                next_step=f"Remove one of them from {FILE}",
+            )
 
 
 def _check_shared(dataset: Dataset, reference: Dataset, hashes: list[list[str]]) -> None:

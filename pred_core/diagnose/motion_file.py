@@ -4,6 +4,8 @@
     name, why, distance_mm, distance_sigma, rivals
     start       the recording and frame it begins like; rest_first [s]: how long the object rests there before
     limits      box [m], speeds [m/s], [rad/s] and acceleration [m/s^2] that it stays within
+    arm         parameters that the arm node needs for it at least (`pred_core.arm.plan_needs`): its guard is slower
+                unless told otherwise, and refuses the plan or lags behind it
     trajectory  trajectory_msgs/MultiDOFJointTrajectory field by field: header.frame_id as frame_id, joint_names,
                 points with time_from_start [s] and transforms, one a gripper: translation [m], rotation wxyz.
                 Starts and ends at rest; the last two points are the same pose.
@@ -17,8 +19,16 @@ from typing import Any
 
 import yaml
 
+from pred_core.arm.limits import GuardConfig
+from pred_core.arm.plan_needs import as_parameters
+
 FORMAT = 1
-KEPT = ("name", "why", "distance_mm", "distance_sigma", "rivals", "start", "limits", "trajectory")
+KEPT = ("name", "why", "distance_mm", "distance_sigma", "rivals", "start", "limits", "arm", "trajectory")
+
+
+def for_the_arm(motion: Mapping[str, Any]) -> str:
+    """What to give an arm node that has its usual parameters: "-p speed:=0.8 ..."; "" where they are enough."""
+    return as_parameters(motion["arm"], GuardConfig())
 
 
 def write_motion(path: Path, motion: Mapping[str, Any]) -> None:

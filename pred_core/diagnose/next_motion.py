@@ -8,13 +8,14 @@ tell the causes apart only by luck: whips and coils, where anything small decide
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
+from pred_core.arm.plan_needs import needs_of
 from pred_core.diagnose.apart import THINNED, Rival, Rolled, Separation, roll, separation
 from pred_core.diagnose.chosen import chosen_of
 from pred_core.diagnose.evidence import Judged
@@ -154,6 +155,7 @@ def _told(twin: Twin, pair: tuple[Rival, Rival], tried: Tried) -> dict[str, Any]
         f"{LONGEST:g} s, after either has taken the strength that looks most like the other), {sds[best]:.0f} standard "
         f"deviations in all; in the median of the {len(tried.motions)} motions tried, {float(np.median(mean)):.1f} mm"
     )
+    followed = trajectory(motion, start.grip, twin.meta.period)
     return {
         "name": motion.name,
         "why": why[0].upper() + why[1:],
@@ -176,8 +178,21 @@ def _told(twin: Twin, pair: tuple[Rival, Rival], tried: Tried) -> dict[str, Any]
             "time": (widest + 1) * THINNED * twin.meta.period,
             "shapes": [r.position[best, widest].tolist() for r in (tried.first, tried.second)],
         },
-        "trajectory": trajectory(motion, start.grip, twin.meta.period),
+        "arm": arm_needs(followed),
+        "trajectory": followed,
     }
+
+
+def arm_needs(trajectory: Mapping[str, Any]) -> dict[str, float]:
+    """Parameters of the arm node that every gripper's way needs at least."""
+    points = trajectory["points"]
+    times = np.array([p["time_from_start"] for p in points])
+    rows = []
+    for g in range(len(trajectory["joint_names"])):
+        position = np.array([p["transforms"][g]["translation"] for p in points])
+        rotation = np.array([p["transforms"][g]["rotation"] for p in points])
+        rows.append(needs_of(times, position, rotation))
+    return {name: max(r[name] for r in rows) for name in rows[0]}
 
 
 def trajectory(motion: Motion, start: Grip, period: float) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,15 +11,18 @@ from pred_core.errors import ConfigError
 JOURNAL = "journal.jsonl"
 TWIN = "twin"
 GUARD = ("guard.json", "guard.html")
-RESULTS = ("diagnosis.json", "report.html", "next_motion.yaml", *GUARD, TWIN)
+ANSWER = ("diagnosis.json", "report.html", "next_motion.yaml")
+RESULTS = (*ANSWER, *GUARD, TWIN)
+OURS = {"outcome", "sentence", "causes"}  # what every diagnosis.json has
 
 
 def check_out(out: Path, twin: Path, data: Mapping[str, Path]) -> None:
     """`data`: what a data set is called in a message -> its folder. Links are followed.
 
-    Raises: ConfigError if `out` is the folder of an input, if an input lies where the answer's twin is written, or if
-    a twin lies there that no diagnosis wrote.
+    Raises: ConfigError if `out` is no folder or that of an input, if an input lies where the answer's twin is written,
+    or if a twin, a report or another result lies there that no diagnosis wrote.
     """
+    _check_folder(out)
     _check_not_the_folder(out, {"the twin": twin, **data})
     place, result, given = out.resolve(), (out / TWIN).resolve(), twin.resolve()
     if given.is_relative_to(place) or given.is_relative_to(result):
@@ -35,8 +39,17 @@ def check_out(out: Path, twin: Path, data: Mapping[str, Path]) -> None:
                 got=f"{root} and --out {out}, which writes {out / TWIN}",
                 next_step="Give another --out",
             )
-    ours = (out / "diagnosis.json").exists() or any(out.glob("journal*.jsonl"))
-    if (out / TWIN).exists() and not ours:
+    if _ours(out):
+        return
+    foreign = [name for name in ANSWER if (out / name).exists()]
+    if foreign:
+        raise ConfigError(
+            f"--out holds {', '.join(foreign)} that no diagnosis wrote there, and the answer's would replace it",
+            got=f"{out} without a diagnosis.json of ours or {JOURNAL}",
+            allowed="a new folder, or one with an earlier diagnosis",
+            next_step="Give another --out, or move it away",
+        )
+    if (out / TWIN).exists():
         raise ConfigError(
             "--out holds a twin that no diagnosis wrote there, and the twin of the answer would replace it",
             got=f"{out / TWIN} without diagnosis.json or {JOURNAL} beside it",
@@ -47,8 +60,9 @@ def check_out(out: Path, twin: Path, data: Mapping[str, Path]) -> None:
 def check_guard_out(out: Path, data: Path) -> None:
     """The question about the network writes two files, which a twin's folder may hold: `pred train` writes them there.
 
-    Raises: ConfigError if `out` is the data set's folder.
+    Raises: ConfigError if `out` is no folder, or the data set's.
     """
+    _check_folder(out)
     _check_not_the_folder(out, {"the data set": data})
 
 
@@ -71,6 +85,33 @@ def remove_guard(out: Path) -> None:
     """Remove what was said of an earlier twin's network."""
     for name in GUARD:
         (out / name).unlink(missing_ok=True)
+
+
+def _ours(out: Path) -> bool:
+    """Whether a diagnosis wrote into the folder: its answer, or its journal or one that it put aside."""
+    try:
+        found = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        found = None
+    return (isinstance(found, dict) and set(found) >= OURS) or any(map(_is_journal, out.glob("journal*.jsonl")))
+
+
+def _is_journal(path: Path) -> bool:
+    try:
+        with path.open(encoding="utf-8") as stream:
+            first = json.loads(stream.readline())
+    except (OSError, ValueError):
+        return False
+    return isinstance(first, dict) and isinstance(first.get("header"), dict)
+
+
+def _check_folder(out: Path) -> None:
+    for place in (out, *out.parents):
+        if place.exists() and not place.is_dir():
+            raise ConfigError(
+                "--out must be a folder", got=f"{place}, which is a file", allowed="a folder, new or not",
+                next_step="Give another --out",
+            )  # fmt: skip
 
 
 def _check_not_the_folder(out: Path, inputs: Mapping[str, Path]) -> None:

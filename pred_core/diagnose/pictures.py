@@ -34,7 +34,7 @@ def evidence(seen: Round, words: dict[str, str], named: Judged | None, seed: int
     """What each fitted candidate saves on episodes it did not see, as share of `whole_of`; dots are episodes."""
     judged = sorted((j for j, _, _ in seen.judged), key=lambda j: j.mean)
     excess, of = whole_of(seen)
-    figure = Figure(figsize=(9.5, 0.9 + 0.36 * len(judged)), layout="constrained")
+    figure = Figure(figsize=(9.5, 1.1 + 0.36 * len(judged)), layout="constrained")
     axes = figure.subplots()
     axes.axvline(0.0, color=GREY, linewidth=0.9)
     axes.axvline(100.0, color=GREY, linewidth=0.9, linestyle=":")
@@ -49,7 +49,7 @@ def evidence(seen: Round, words: dict[str, str], named: Judged | None, seed: int
     axes.set_ylim(-0.6, len(judged) - 0.4)
     every = 100.0 * np.concatenate([j.gain for j in judged]) / excess
     axes.set_xlim(max(float(every.min()) - 5.0, -150.0), min(float(every.max()) + 5.0, 400.0))
-    tidy(axes, f"saved on the episodes it is judged on [% of {of}]", "")
+    tidy(axes, f"saved on the episodes it is judged on\n[% of {of}]", "")
     axes.grid(False, axis="y")
     axes.tick_params(axis="y", colors=INK)
     return figure

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from pred_core.diagnose.motion_file import for_the_arm
 from pred_core.diagnose.report_parts import words
 from pred_core.diagnose.result import Diagnosis
 from pred_core.evaluate.style import GREY, INK, tidy
@@ -44,9 +45,16 @@ def add_next_motion(page: Page, d: Diagnosis) -> None:
         f"{begin['rest_first']:g} s, and stays within what the recordings showed: {bound['speed']:.2f} m/s, "
         f"{bound['acceleration']:.1f} m/s^2, {bound['turn_speed']:.2f} rad/s and their box. Ranked by the distance in "
         "standard deviations of track noise and of what small changes of start and base do. As a plan: "
-        "next_motion.yaml.",
+        f"next_motion.yaml. {_for_the_arm(motion)}",
         note=True,
     )
+
+
+def _for_the_arm(motion: Mapping[str, Any]) -> str:
+    needs = for_the_arm(motion)
+    if not needs:
+        return "The arm node's usual limits allow it."
+    return f"The arm node's usual limits do not allow it: it needs {needs}, where that is safe."
 
 
 def _caption(motion: Mapping[str, Any]) -> str:

@@ -13,6 +13,8 @@ from pred_core.diagnose.judge import Bench
 from pred_core.twin import Twin
 from pred_core.types import Array
 
+SLOWER = 2.0  # times the substeps of the round before, from which its expected time must be there before the deadline
+
 
 @dataclass(frozen=True)
 class Named:
@@ -43,7 +45,10 @@ class Progress:
     bench: Bench
     journal: Journal
     twins: list[Twin]  # before anything was named, and after each name
-    deadline: float = math.inf  # [s] of `time.monotonic`
+    deadline: float = math.inf  # [s] of `time.monotonic`, after which nothing more is begun
+    latest: float = math.inf  # [s] the same, by which a round must be expected to end to be begun
+    took: float = 0.0  # [s] of the last round; what the journal has of it took no time
+    needed: float = 0.0  # substeps a period of the twin in the last round
     named: list[Named] = field(default_factory=list)
     rounds: list[Round] = field(default_factory=list)
     unknown: bool = False
@@ -79,6 +84,20 @@ class Progress:
         self.twins.pop()
         self.rounds.pop()
         self.bench = bench
+
+    def expected(self) -> float:
+        """[s] that another round takes, from the last one: what was named may need many more substeps."""
+        return self.took * max(self.slower(), 1.0)
+
+    def slower(self) -> float:
+        """Times the substeps of the last round that another one needs."""
+        return self.bench.target.roller.usual() / self.needed if self.needed else 1.0
+
+    def time_for_another(self) -> bool:
+        """Whether another round may begin. One that is much slower than the last is known badly: it must end sooner."""
+        if self.late(self.expected() if self.slower() > SLOWER else 0.0):
+            return False
+        return time.monotonic() + self.expected() <= self.latest
 
     def late(self, needs: float = 0.0) -> bool:
         """Whether the time is used up, or would be after `needs` [s] more."""

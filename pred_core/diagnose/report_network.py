@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from pred_core.diagnose.guard import OPEN, Guard
 from pred_core.diagnose.guard_forces import LATER
@@ -24,14 +25,33 @@ def read_network(path: Path) -> Network:
             split: {cell: {k: float(values[cell][k]) for k in SUMMARY} for cell in CELLS}
             for split, values in found.items()
         }
-    except (OSError, json.JSONDecodeError) as error:
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         step = "Make it with benchmarks/network_2x2.py"
         raise ConfigError(f"{path}: cannot be read", got=error, next_step=step) from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ConfigError(
-            f"{path}: not errors with and without a network", got=repr(error),
-            allowed=f"split: {{{' | '.join(CELLS)}: {{{', '.join(SUMMARY)}}}}}",
-        ) from error  # fmt: skip
+            f"{path}: not errors with and without a network",
+            got=_lacking(found),
+            allowed=f"for each split {', '.join(CELLS)}, each with {', '.join(SUMMARY)} in mm",
+            next_step="Make it with benchmarks/network_2x2.py",
+        ) from error
+
+
+def _lacking(found: Any) -> str:
+    """The first thing that is wrong with it, in words."""
+    if not isinstance(found, dict):
+        return f"{type(found).__name__}, not a mapping from splits"
+    for split, values in found.items():
+        for cell in CELLS:
+            row = values.get(cell) if isinstance(values, dict) else None
+            if not isinstance(row, dict):
+                return f"split '{split}' without '{cell}'"
+            for k in SUMMARY:
+                if k not in row:
+                    return f"'{cell}' of split '{split}' without '{k}'"
+                if not isinstance(row[k], (int, float)):
+                    return f"{row[k]!r} as '{k}' of '{cell}' of split '{split}'"
+    return "something else"
 
 
 def add_network(page: Page, network: Network | None, guard: Guard | None) -> None:

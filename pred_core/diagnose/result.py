@@ -20,10 +20,10 @@ class Value:
 
     value: float
     unit: str
-    low: float  # 90 % interval
+    low: float  # 90 % interval, where `interval`
     high: float
     at_bound: bool = False
-    interval: bool = True  # False: low and high are only the bounds of the search, nothing measured
+    interval: bool = True  # False: low and high are only the bounds of the search, nothing measured; null in the JSON
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,11 @@ class Diagnosis:
         return {i for seen in self.rounds for j, _, _ in seen.judged for i in j.trial.ids}
 
     def to_json(self) -> dict[str, Any]:
-        """`diagnosis.json` (DESIGN.md, and beside it what the report shows)."""
+        """`diagnosis.json` (DESIGN.md, and beside it what the report shows).
+
+        `low` and `high` of a parameter are null where no interval was measured (one recording, or so wide that it ends
+        with the search on both sides), `low_mm` and `high_mm` of the gain where one episode gave none.
+        """
         e = self.errors
         return {
             "outcome": self.outcome,
@@ -123,7 +127,7 @@ class Diagnosis:
             "motion_explained": self.explained,
             "error_mm_ood": {} if self.errors_ood is None else _errors(self.errors_ood),
             "gain": {
-                "mean_mm": e.gain.mean, "low_mm": e.gain.low, "high_mm": e.gain.high,
+                "mean_mm": e.gain.mean, **_span("low_mm", "high_mm", e.gain.low, e.gain.high, e.gain.episodes > 1),
                 "episodes_improved": f"{e.gain.improved}/{e.gain.episodes}",
                 "p_adjusted": self.p_adjusted,
             },
@@ -150,10 +154,20 @@ def _cause(c: Cause) -> dict[str, Any]:
         "group": list(c.group),
         "contradicted": c.contradicted,
         "parameters": {
-            k: {"value": v.value, "unit": v.unit, "low": v.low, "high": v.high, "at_bound": v.at_bound}
+            k: {
+                "value": v.value,
+                "unit": v.unit,
+                **_span("low", "high", v.low, v.high, v.interval),
+                "at_bound": v.at_bound,
+            }
             for k, v in c.parameters.items()
         },
     }
+
+
+def _span(lower: str, upper: str, low: float, high: float, known: bool) -> dict[str, float | None]:
+    """Both ends of an interval by name; null where there is none."""
+    return {lower: low if known else None, upper: high if known else None}
 
 
 def _errors(e: Errors) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pred_core.diagnose.sample import Sample
-from pred_core.effects import find_effect
+from pred_core.effects import effect_of, find_effect
 from pred_core.identify.space import Candidate
 from pred_core.springmass import SpringMass
 from pred_core.springmass.arrays import mass_of_worlds
@@ -41,7 +41,7 @@ class Roller:
     def demand(self, candidate: Candidate) -> float:
         """Substeps a period that keep this candidate stable."""
         body = self.twin.body
-        effects = tuple(find_effect(e.id) for e in candidate.extensions)
+        effects = tuple(effect_of(e) for e in candidate.extensions)
         mass = None
         if any("inertia" in e.hooks for e in effects):
             mass = mass_of_worlds(body, [candidate.extensions], effects)[0].double().numpy()

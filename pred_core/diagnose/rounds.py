@@ -12,6 +12,7 @@ from pred_core.diagnose.evidence import Judged, lack_of_fit
 from pred_core.diagnose.fit import IN_FULL, counted
 from pred_core.diagnose.judge import QUICK, Bench, Effects, Screened, Tell, judge, quick, rng_of, scaled, screen
 from pred_core.diagnose.naming import FEWEST, LEFT, STANDING, choose
+from pred_core.diagnose.pace import Pace
 from pred_core.diagnose.pairs import try_pairs
 from pred_core.diagnose.places import Start
 from pred_core.diagnose.progress import Progress, Round
@@ -26,6 +27,7 @@ WORTH = 0.03  # of the floor: what a candidate must promise to be fitted to the 
 SURE = 0.02  # p value of a lack of fit
 FEW, FINALISTS = 2, 5  # candidates that are fitted to the end: at least, and at most
 BEHIND = 0.35  # share of the leader's gain below which the others are not
+TOLD = 4  # candidates between two lines
 NOISE = 0.4  # loss of residuals that are noise: the mean of rho(u) for u ~ N(0, 1) is 0.36
 UNEXPLAINED = 1.2  # loss beyond which, without a reference, what is left is worth saying
 USUALLY = 3.0  # times the reference's loss: the same where there are too few episodes for a test
@@ -60,29 +62,29 @@ _SAME_AS_BASE = ("friction_scale", "bending_scale", "stretch_scale")
 def one_round(progress: Progress, tell: Tell, number: int) -> bool:
     """Look for one more cause. Returns whether something was named."""
     bench, config = progress.bench, progress.bench.config
-    base = bench.standing()
-    floor = float(_reference_losses(bench).mean()) if bench.reference is not None else 0.0
-    if progress.rounds and not _something_left(progress, base, floor):
-        return False
+    base, floor = bench.standing(), _floor(bench)
     progress.well = explains_well(bench)
     named = [i for n in progress.named for i in n.judged.trial.ids]
     options = candidates(bench, named)
     screened = []
+    pace = Pace(len(options), progress.journal)
     for n, effects in enumerate(options):
         key = f"{number}/screen/{'+'.join(e.id for e in effects)}"
         screened.append(screen(bench, effects, rng_of(config.seed, key), progress.journal, key))
         if n % 8 == 0:
-            tell(f"round {number + 1}: screening {n}/{len(options)}")
+            left = pace.left(n + 1) if n else ""  # the first ones are the cheapest
+            tell(f"round {number + 1}: screening {n + 1}/{len(options)}{left}")
     screened.sort(key=lambda s: -s.promise)
     tell("round {}: most promising: {}".format(number + 1, ", ".join(s.trial.id for s in screened[:4])))
     worth = WORTH * (floor or float(base.mean()))
     kept = _survivors(screened, config.survivors, worth)
     finalists = _halve(progress, kept, worth, tell, number)
     judged: list[Judged] = []
+    pace = Pace(len(finalists), progress.journal)
     for n, s in enumerate(finalists):
         judged.append(judge(bench, s, progress.journal, f"{number}/fit/{s.trial.id}"))
         gain = f"gain {judged[-1].mean:.3f} of {base.mean():.3f}"
-        tell(f"round {number + 1}: fitted {n + 1}/{len(finalists)}, {s.trial.id}: {gain}")
+        tell(f"round {number + 1}: fitted {n + 1}/{len(finalists)}, {s.trial.id}: {gain}{pace.left(n + 1)}")
     kept = finalists
     excess = float(base.mean()) - floor
     found, rows = choose(judged, excess, floor, progress)
@@ -107,9 +109,11 @@ def explains_well(bench: Bench) -> bool:
     return found is None or found.share >= WELL
 
 
-def _something_left(progress: Progress, base: Array, floor: float) -> bool:
-    """Whether what is left after a name is worth another look."""
-    first = progress.rounds[0]
+def something_left(progress: Progress) -> bool:
+    """Whether what is left is worth another look; before the first one it is."""
+    if not progress.rounds:
+        return True
+    first, base, floor = progress.rounds[0], progress.bench.standing(), _floor(progress.bench)
     whole = float(first.base.mean()) - first.floor
     if progress.bench.reference is None:
         return float(base.mean()) > _counts(progress.bench, NOISE)
@@ -157,6 +161,11 @@ def _counts(bench: Bench, loss: float) -> float:
     return float(counted(np.array(loss), bench.target.usual))
 
 
+def _floor(bench: Bench) -> float:
+    """Mean loss of the reference; without one nobody knows it."""
+    return float(_reference_losses(bench).mean()) if bench.reference is not None else 0.0
+
+
 def _reference_losses(bench: Bench) -> Array:
     assert bench.reference is not None
     space = make_trial(bench.reference_twin, (), ()).space
@@ -183,7 +192,10 @@ def _halve(
     bench = progress.bench
     before = float(bench.counting(IN_FULL).standing()[bench.train].mean())
     rows = []
-    for s in kept:
+    pace = Pace(len(kept), progress.journal)
+    for n, s in enumerate(kept):
+        if n % TOLD == 1:
+            tell(f"round {number + 1}: {QUICK} steps of {n}/{len(kept)}{pace.left(n)}")
         z, loss = quick(bench, s, progress.journal, f"{number}/quick/{s.trial.id}")
         rows.append((before - loss, dataclasses.replace(s, starts=[Start(z, before - loss)])))
     rows.sort(key=lambda row: -row[0])

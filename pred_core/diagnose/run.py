@@ -17,7 +17,7 @@ from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Tell
 from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.result import Diagnosis
-from pred_core.diagnose.rounds import finish, one_round
+from pred_core.diagnose.rounds import finish, one_round, something_left
 from pred_core.diagnose.skill import check_reference
 from pred_core.diagnose.structure import applies, question
 from pred_core.errors import DatasetError
@@ -25,8 +25,8 @@ from pred_core.twin import Twin
 from pred_core.types import Episode
 
 MOST_LEFT_OUT = 0.2  # of the episodes
-SLOWER = 2.0  # times the substeps of the round before, from which the time of a round is estimated before it begins
 LATEST = 0.8  # share of the time after which no further round begins; the errors and the report take the rest
+OVER = 0.25  # share of the time by which a round may be expected to end too late, going by the last one
 
 
 def diagnose(
@@ -61,22 +61,24 @@ def diagnose(
     fitted = [e for e in fitted if e.name not in left_out]
     bench = commission(plain, fitted, known, config, tell, journal, session)
     check_reference(bench)
-    progress = Progress(bench, journal, [bench.twin], deadline=begin + LATEST * config.seconds)
+    progress = Progress(
+        bench, journal, [bench.twin], begin + LATEST * config.seconds, begin + (1.0 + OVER) * config.seconds
+    )
     if left_out:
         why = "left out of fitting and judging, because a marker has moved on the object (`pred info`)"
         progress.notes.append(f"{why}: {', '.join(left_out)}")
-    used = _change_structure(progress, tell) if bench.reference is None and applies(bench.twin) else 0
-    took, needed = 0.0, bench.target.roller.usual()  # [s], substeps of the last round
+    ends = begin + config.seconds
+    used = _change_structure(progress, tell, ends) if bench.reference is None and applies(bench.twin) else 0
     for number in range(used, config.causes):
-        needs = progress.bench.target.roller.usual()
-        slower = needs / needed  # what was named may need many more substeps
-        if number and progress.late(took * slower if slower > SLOWER else 0.0):
+        if not something_left(progress):
+            break
+        if number and not progress.time_for_another():
             progress.notes.append(f"stopped after {number} rounds: no time for more in --seconds {config.seconds:g}")
+            about = f" (another takes about {progress.expected():.0f} s)" if progress.took >= 1.0 else ""
+            tell(f"{progress.notes[-1]}{about}")
             break
-        started = time.monotonic()
-        if not one_round(progress, tell, number):
+        if not _timed_round(progress, tell, number, ends):
             break
-        took, needed = time.monotonic() - started, needs
         found = progress.named[-1]
         tell(f"named: {found.judged.trial.id}, closes {found.closed:.0%} of the excess")
     check_forms(progress, tell)
@@ -84,6 +86,16 @@ def diagnose(
     check_table(progress, gate)
     study = Study(tuple(episodes), tuple(corrected), tuple(known), twin, gate, bench, session)
     return answer(study, progress, begin, tell)
+
+
+def _timed_round(progress: Progress, tell: Tell, number: int, ends: float) -> bool:
+    """`one_round`, and how long it took. `ends` [s] of `time.monotonic`: when the time is over."""
+    started, needs = time.monotonic(), progress.bench.target.roller.usual()
+    about = f"about {progress.expected():.0f} s, as the one before; " if progress.took >= 1.0 else ""
+    tell(f"round {number + 1}: {about}{max(ends - started, 0.0):.0f} s left of --seconds")
+    more = one_round(progress, tell, number)
+    progress.took, progress.needed = time.monotonic() - started, needs
+    return more
 
 
 def moved_markers(episodes: Sequence[Episode]) -> list[str]:
@@ -120,7 +132,7 @@ def _check(
         raise DatasetError("two bags have one name", got=", ".join(twice[:3]), next_step="Rename one of them")
 
 
-def _change_structure(progress: Progress, tell: Tell) -> int:
+def _change_structure(progress: Progress, tell: Tell, ends: float) -> int:
     """Name bending by angle, if a chain with it is better than the springs as they are. Returns the rounds used."""
     before = progress.bench
     base = before.standing()
@@ -131,7 +143,7 @@ def _change_structure(progress: Progress, tell: Tell) -> int:
     progress.add(Named(judged, p, (), judged.mean / float(base.mean()), -1), bench)
     if float(bench.standing().mean()) < float(base.mean()):
         return 0
-    if not one_round(progress, tell, 0):  # judged together with damping, which was not found
+    if not _timed_round(progress, tell, 0, ends):  # judged together with damping, which was not found
         progress.withdraw(before)
         tell("bending by angle: withdrawn")
     return 1

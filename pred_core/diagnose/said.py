@@ -43,12 +43,14 @@ STILL = 0.01  # [m] of gripper travel in an episode below which nothing is excit
 
 
 def called(cause: Cause) -> str:
-    """A cause in words with its main number."""
+    """A cause in words with its main number: its effect's headline, or the first of its parameters."""
     words = NAMES.get(cause.id, cause.id.replace("_", " "))
     if not cause.parameters:
         return words
-    name = next(iter(cause.parameters)).split("[")[0]
-    values = [v for k, v in cause.parameters.items() if k.split("[")[0] == name]
+    shown = LIBRARY[cause.id].headline if cause.id in LIBRARY else ""
+    plain = [k.split("[")[0] for k in cause.parameters]
+    name = shown if shown in plain else plain[0]
+    values = [v for k, v in zip(plain, cause.parameters.values(), strict=True) if k == name]
     unit = "" if values[0].unit == "1" else f" {values[0].unit}"
     if len(values) == 1:
         v = values[0]
@@ -129,7 +131,7 @@ def without_interval(causes: Sequence[Cause]) -> str:
     ]
     if not rows:
         return ""
-    return f"no interval for {', '.join(rows)}: what diagnosis.json has as low and high only bounds the search"
+    return f"no interval for {', '.join(rows)}: low and high are null in diagnosis.json"
 
 
 def _no_base(d: Diagnosis) -> bool:

@@ -7,7 +7,9 @@ the line's chords. It is a cause of another kind than the effects: the springs t
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +17,8 @@ from pred_core.diagnose.commission import base_fields, refined, values_of, with_
 from pred_core.diagnose.evidence import Judged, family_wise
 from pred_core.diagnose.fit import Target
 from pred_core.diagnose.journal import Journal
-from pred_core.diagnose.judge import Bench, Tell
+from pred_core.diagnose.judge import JACKKNIFE, Bench, Tell
+from pred_core.diagnose.pace import Pace
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.trial import Trial, make_trial
 from pred_core.effects import find_effect
@@ -72,11 +75,11 @@ def question(bench: Bench, journal: Journal, tell: Tell) -> tuple[Bench, Judged,
     found like any other cause.
     """
     before = bench.standing()
-    best = _asked(bench, (), journal, "structure")
+    best = _asked(bench, (), journal, "structure", tell)
     tell(f"bending by angle: gain {best.judged.mean:.3f} of {before.mean():.3f}")
     least = bench.config.cold_gate * float(before.mean())
     if best.judged.mean < least:
-        best = _asked(bench, (COMPANION,), journal, "structure/damped")
+        best = _asked(bench, (COMPANION,), journal, "structure/damped", tell)
         tell(f"bending by angle, with damping: gain {best.judged.mean:.3f} of {before.mean():.3f}")
     p = float(family_wise([best.judged], bench.config.seed)[0])
     if p > bench.config.level or best.judged.mean < least:
@@ -101,34 +104,43 @@ class _Asked:
     judged: Judged
 
 
-def _asked(bench: Bench, beside: tuple[type[Effect], ...], journal: Journal, key: str) -> _Asked:
+def _asked(bench: Bench, beside: tuple[type[Effect], ...], journal: Journal, key: str, tell: Tell) -> _Asked:
     """Fit the chain, with effects `beside` it, on the train episodes; judge it by parameters of other recordings."""
     fitted, target = bench.fitted, bench.target
     slim = _with(chain(bench.twin), beside)
+    with_damping = " with damping" if beside else ""
 
     def fit_chain() -> dict[str, object]:
+        tell(f"bending by angle{with_damping}: a coarse grid, then a fit without each recording")
         twin = refined(_first(slim, beside, fitted), fitted, None, beside=beside)
         rows = []
         groups = fitted.roller.sample.groups
-        for group in sorted(set(groups.tolist())):
+        every = sorted(set(groups.tolist()))
+        pace = Pace(len(every), journal)
+        for n, group in enumerate(every, 1):
             keep = np.flatnonzero(groups != group).tolist()
             own = refined(twin, fitted.part(keep), None, steps=1, beside=beside) if keep else twin
             rows.append([int(group), values_of(own)])
+            tell(f"bending by angle{with_damping}: fitted without {n}/{len(every)} recordings{pace.left(n)}")
         return {"twin": values_of(twin), "without": rows}
 
-    stored = journal.once(key, fit_chain)
-    twin = with_stored(slim, stored["twin"])
+    def read(stored: dict[str, Any]) -> tuple[Twin, dict[int, Twin]]:
+        without = {int(group): with_stored(slim, values) for group, values in stored["without"]}
+        if set(without) != set(fitted.roller.sample.groups.tolist()):
+            raise ValueError(f"fits without {len(without)} recordings, expected one without each")
+        return with_stored(slim, stored["twin"]), without
+
+    twin, without = journal.piece(key, fit_chain, read)
     base = _losses(bench.twin, target)
     extended = _losses(twin, target)
-    for group, values in stored["without"] if bench.config.cross_fit else ():
+    for group, other in without.items() if bench.config.cross_fit else ():
         mine = target.roller.sample.groups == group
         if mine.any():
-            extended[mine] = _losses(with_stored(slim, values), target)[mine]
+            extended[mine] = _losses(other, target)[mine]
     trial = _trial(twin)
     knobs = trial.space.knobs
-    spread = [with_stored(slim, v).physics.bending_stiffness for _, v in stored["without"]]
     value = twin.physics.bending_stiffness
-    width = 1.645 * float(np.std(spread)) * (len(spread) - 1) ** 0.5 if len(spread) > 1 else value  # one: not known
+    width = _width([t.physics.bending_stiffness for t in without.values()], value)
     judged = Judged(
         trial=trial,
         values={k.name: value for k in knobs},
@@ -140,6 +152,13 @@ def _asked(bench: Bench, beside: tuple[type[Effect], ...], journal: Journal, key
         z=trial.space.start(),
     )
     return _Asked(twin, judged)
+
+
+def _width(spread: Sequence[float], value: float) -> float:
+    """Half a 90 % interval of the value, by the jackknife over recordings as `judge.intervals` has it; of one recording
+    nothing is known."""
+    groups = len(spread)
+    return JACKKNIFE.get(groups, 1.8) * float(np.std(spread)) * (groups - 1) ** 0.5 if groups > 1 else value
 
 
 def _with(twin: Twin, effects: tuple[type[Effect], ...]) -> Twin:

@@ -6,6 +6,7 @@ import importlib
 
 from pred_core.effects.effect import Effect
 from pred_core.errors import TwinError, nearest
+from pred_core.twin import Extension
 
 # In this order they are listed and tried.
 IDS = (
@@ -70,6 +71,16 @@ def find_effect(id: str) -> type[Effect]:
     if id not in LIBRARY:
         raise TwinError(f"unknown effect '{id}'", next_step=nearest(id, LIBRARY))
     return LIBRARY[id]
+
+
+def effect_of(extension: Extension) -> type[Effect]:
+    """The effect of an entry of a twin, whose values fit it. Raises: TwinError naming the file the entry is from."""
+    if extension.id not in LIBRARY:
+        where = f"{extension.source}: " if extension.source else ""
+        raise TwinError(f"{where}unknown effect '{extension.id}'", next_step=nearest(extension.id, LIBRARY))
+    effect = LIBRARY[extension.id]
+    effect.check(extension)
+    return effect
 
 
 def confounded(id: str) -> tuple[str, ...]:

@@ -147,6 +147,8 @@ class Effect:
     form: ClassVar[str] = ""
     end_twist: ClassVar[str] = ""  # the parameter [rad] by which a line's far material axes are turned in its gripper
 
+    headline: ClassVar[str] = ""  # the parameter that stands for the cause where one is shown; "": the first
+
     @classmethod
     def in_form(cls, p: Mapping[str, tuple[float, ...]], physics: Physics) -> dict[str, tuple[float, ...]]:
         """Parameters of the effect `form` that are the same law."""
@@ -241,17 +243,19 @@ class Effect:
     @classmethod
     def check(cls, extension: Extension) -> None:
         """Raise TwinError unless the values fit the declaration: version, names, exactly `size` numbers, bounds."""
+        where = f"{extension.source}: " if extension.source else ""
+        what = f"{where}effect '{cls.id}'"
         if extension.version != cls.version:
-            raise TwinError(f"effect '{cls.id}': version", got=extension.version, allowed=cls.version)
+            raise TwinError(f"{what}: version", got=extension.version, allowed=cls.version)
         known = {q.name: q for q in cls.parameters}
         for name in extension.parameters:
             if name not in known:
-                raise TwinError(f"effect '{cls.id}' has no parameter '{name}'", next_step=nearest(name, known))
+                raise TwinError(f"{what} has no parameter '{name}'", next_step=nearest(name, known))
         for name, q in known.items():
             values = extension.parameters.get(name)
             numbers = isinstance(values, tuple) and all(type(v) in (int, float) for v in values)
             if values is None or not numbers or len(values) != q.size:
-                raise TwinError(f"effect '{cls.id}': '{name}'", got=values, allowed=f"{q.size} value(s) [{q.unit}]")
+                raise TwinError(f"{what}: '{name}'", got=values, allowed=f"{q.size} value(s) [{q.unit}]")
             for value in values:
                 if not (np.isfinite(value) and (value == q.null or q.low <= value <= q.high)):
-                    raise TwinError(f"effect '{cls.id}': '{name}'", got=value, allowed=f"{q.low} to {q.high} {q.unit}")
+                    raise TwinError(f"{what}: '{name}'", got=value, allowed=f"{q.low} to {q.high} {q.unit}")

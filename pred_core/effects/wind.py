@@ -30,6 +30,7 @@ class Wind(Effect):
     )
     confounded_with = ("drag_quadratic", "gravity_offset", "attraction")
     reads_tangent = True
+    headline = "velocity"
 
     @classmethod
     def force(cls, p: Mapping[str, Any], at: ParticleContext) -> Vec3:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pred_core.effects import find_effect
+from pred_core.effects import effect_of
 from pred_core.identify.space import Candidate
 from pred_core.identify.topology import Topology
 from pred_core.identify.windows import Windows
@@ -60,7 +60,7 @@ class Problem:
     def demand(self, candidate: Candidate) -> float:
         """Substeps a period that keep this candidate stable (`springmass.stability`), neither rounded nor limited."""
         body = self.body if self.topology is None else self.topology.body(candidate.physics)
-        effects = tuple(find_effect(e.id) for e in candidate.extensions)
+        effects = tuple(effect_of(e) for e in candidate.extensions)
         mass = None
         if any("inertia" in e.hooks for e in effects):
             mass = mass_of_worlds(body, [candidate.extensions], effects)[0].double().numpy()

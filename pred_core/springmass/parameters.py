@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pred_core.effects import find_effect
+from pred_core.effects import effect_of
 from pred_core.effects.effect import Effect
 from pred_core.errors import ConfigError
 from pred_core.springmass.stability import Added
@@ -37,11 +37,8 @@ def effects_of(per_world: PerWorld) -> tuple[type[Effect], ...]:
     ids = [[e.id for e in extensions] for extensions in per_world]
     if any(i != ids[0] for i in ids) or len(set(ids[0])) != len(ids[0]):
         raise ConfigError("extensions", got=ids[0], allowed="the same effects in every world, each once")
-    effects = tuple(find_effect(i) for i in ids[0])
-    for extensions in per_world:
-        for effect, extension in zip(effects, extensions, strict=True):
-            effect.check(extension)
-    return effects
+    found = [tuple(effect_of(e) for e in extensions) for extensions in per_world]
+    return found[0]
 
 
 def added_by(body: Body, extensions: Sequence[Extension]) -> Added:
@@ -55,7 +52,7 @@ def added_by(body: Body, extensions: Sequence[Extension]) -> Added:
     times = torch.tensor([[0.0], [SESSION]], dtype=arc.dtype)
     stiffness, time, rate = 0.0, 0.0, 0.0
     for extension in extensions:
-        effect = find_effect(extension.id)
+        effect = effect_of(extension)
         if "bend_stiffness" in effect.hooks:
             scale = scale + effect.bend_stiffness(extension.parameters, arc, times)
         more, seconds = effect.bend_bound(extension.parameters, length)
