@@ -195,7 +195,7 @@ def _halve(
     pace = Pace(len(kept), progress.journal)
     for n, s in enumerate(kept):
         if n % TOLD == 1:
-            tell(f"round {number + 1}: {QUICK} steps of {n}/{len(kept)}{pace.left(n)}")
+            tell(f"round {number + 1}: first {QUICK} steps of the promising ones {n}/{len(kept)}{pace.left(n)}")
         z, loss = quick(bench, s, progress.journal, f"{number}/quick/{s.trial.id}")
         rows.append((before - loss, dataclasses.replace(s, starts=[Start(z, before - loss)])))
     rows.sort(key=lambda row: -row[0])
