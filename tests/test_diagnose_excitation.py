@@ -75,6 +75,22 @@ def test_of_a_place_what_the_search_found_counts(bench: Bench) -> None:
     assert seen == {0.0: EVERY, 4.0: 0}
 
 
+def test_few_episodes_at_a_place_do_not_make_it_untestable(bench: Bench) -> None:
+    """An obstacle whose search ended where two episodes pass says nothing of where the others pass; a tilted gravity
+    that two of six feel is hardly excited. What no episode feels is not testable, in a place or not.
+    """
+    few = dataclasses.replace(judged(bench.twin, "drag_linear", 1.5, 0.1, [1.0] * EVERY), acts=np.zeros(EVERY, bool))
+    said = {}
+    for id in ("obstacle", "gravity_offset"):
+        for excited in (0, 2):
+            one = dataclasses.replace(few, trial=bench.trial((find_effect(id),)), excited=excited)
+            said[id, excited] = one.testable
+            assert not one.excites
+    assert said == {
+        ("obstacle", 0): False, ("obstacle", 2): True, ("gravity_offset", 0): False, ("gravity_offset", 2): False
+    }  # fmt: skip
+
+
 def test_who_acts_is_not_asked_and_who_is_named_is_testable(bench: Bench) -> None:
     """A vote needs four episodes in which a cause acts, whatever its typical change would move; a name says enough."""
     six = judged(bench.twin, "drag_linear", 1.5, 0.1, [1.0] * EVERY)

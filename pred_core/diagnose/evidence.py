@@ -62,11 +62,22 @@ class Judged:
         return int((self.gain[self.acts] > 0).sum()), int(self.acts.sum())
 
     @property
-    def testable(self) -> bool:
-        """These motions excite it, wherever its fit ended: it acts in FEWEST_ACTING episodes, or would if it were
+    def excites(self) -> bool:
+        """Wherever its fit ended, these motions would show it: it acts in FEWEST_ACTING episodes, or would if it were
         there. A cause that ended at no change although it would act is absent.
         """
-        return max(int(self.acts.sum()), self.excited or 0) >= min(FEWEST_ACTING, len(self.acts))
+        return self._would_move >= min(FEWEST_ACTING, len(self.acts))
+
+    @property
+    def testable(self) -> bool:
+        """These motions can show it. What acts in one place need be felt there in a single episode: few says something
+        of the place its search ended at, not of all the others it was looked for in.
+        """
+        return self.excites or (self._would_move > 0 and any(scanned(find_effect(id)) for id in self.trial.ids))
+
+    @property
+    def _would_move(self) -> int:
+        return max(int(self.acts.sum()), self.excited or 0)
 
     @property
     def worse(self) -> int:

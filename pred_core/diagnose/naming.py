@@ -107,7 +107,7 @@ def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress
 
 def _idle(j: Judged) -> str:
     acts = f"acts in {int(j.acts.sum())} episodes only"
-    return f"fitted to no change: it {acts}, though these motions excite it" if j.testable else acts
+    return f"fitted to no change: it {acts}, though these motions excite it" if j.excites else acts
 
 
 def share_closed(j: Judged, excess: float, floor: float) -> float:
