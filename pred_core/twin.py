@@ -43,7 +43,7 @@ class Extension:
     id: str
     version: int
     parameters: Mapping[str, tuple[float, ...]]  # scalars are 1-tuples
-    evidence: Mapping[str, Any] = field(default_factory=dict)  # how it was found; read by people
+    evidence: Mapping[str, Any] = field(default_factory=dict)  # how it was found; `pred evaluate` reads its `found_by`
     source: str = field(default="", compare=False, repr=False)  # the file it was read from, which a message names
 
 
