@@ -19,7 +19,7 @@ from pred_core.plan.session import Session, Timing
 MOVE = np.array([0.3, -0.1, 0.1])  # [m]
 TICK = 40_000_000  # [ns] planning takes: a sixth of the time until a plan begins
 TIMING = Timing(budget=0.2, margin=0.05)
-GUARD = GuardConfig(speed=0.5)
+GUARD = GuardConfig(speed=0.5, x_low=-0.5, z_high=1.0)
 # A point every 20 ms, straight in between: off a curve of 4 m/s^2 by a dt^2 / 8 = 0.2 mm.
 JOIN = 5e-4  # [m]
 
