@@ -17,7 +17,7 @@ from pred_core.types import Array
 
 EVERY = 2  # ticks between set-points: 75 Hz
 SPACING = 0.02  # [s] between the points of a plan that is sent
-LIFETIME = 5.0  # [s] a plan is followed
+LIFETIME = 6.0  # [s] a plan is followed; the longest that trials send are 5 s
 # The limits of config/nodes/plant.yaml.
 GUARD = GuardConfig(rate=1.0 / (EVERY * TICK), x_high=0.65, z_high=0.35, clearance=0.015)
 SHOWN = ("up", "down", "landed")  # moves of a demonstration
