@@ -313,7 +313,7 @@ def kept_signals() -> Iterator[None]:
 def test_the_model_is_named_after_the_stage_of_its_twin(tmp_path: Path) -> None:
     twin = Twin.load(make_twin(tmp_path / "twin"))
     assert stage_name(twin) == "spring-mass"
-    extended = twin.replace(extensions=(Extension("drag-linear", 1, {"coefficient": (0.1,)}),))
+    extended = twin.replace(extensions=(Extension("drag_linear", 1, {"coefficient": (0.1,)}),))
     assert stage_name(extended) == "extended"
     assert stage_name(extended.replace(residual=ResidualWeights({}, {"w": torch.zeros(1)}))) == "pred"
 
