@@ -30,7 +30,7 @@ from pred_core.bag.wire import GRIPPER_POSE
 from pred_core.errors import ConfigError, InputError
 from pred_ros import convert, qos
 from pred_ros.arm_messages import PLAN
-from pred_ros.commands import run_command
+from pred_ros.commands import Interrupts, run_command
 from pred_ros.diagnostics import OK
 
 PATIENCE = 10.0  # [s] for the arm node to be there
@@ -57,20 +57,22 @@ def go(args: argparse.Namespace) -> int:
     frame, motion, rest = read_motion(args.file, args.gripper)
     if frame != WORLD:
         raise InputError(f"{args.file}: another frame", got=repr(frame), allowed=repr(WORLD))
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    sender = Sender()
-    try:
-        sender.execute(motion, args.approach, rest)
-    finally:
-        sender.close()
-        rclpy.try_shutdown()
+    with Interrupts() as interrupts:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        sender = Sender(interrupts)
+        try:
+            sender.execute(motion, args.approach, rest)
+        finally:
+            sender.close()
+            rclpy.try_shutdown()
     return 0
 
 
 class Sender:
     """Sends one plan to the arm node and watches it."""
 
-    def __init__(self) -> None:
+    def __init__(self, interrupts: Interrupts) -> None:
+        self._interrupts = interrupts
         self._node = Node("motion")
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
@@ -118,7 +120,7 @@ class Sender:
     def _follow(self, begin: int, seconds: float) -> None:
         end, shown = begin + round((seconds + ANSWER) * 1e9), 0.0
         while self._now() < end:
-            self._executor.spin_once(timeout_sec=0.05)
+            self._spin()
             if self._said is not None and self._said[0] != OK:
                 raise InputError(f"arm: {self._said[1]}")
             gone = (self._now() - begin) * 1e-9
@@ -131,8 +133,12 @@ class Sender:
         while time.monotonic() < end:
             if true():
                 return True
-            self._executor.spin_once(timeout_sec=0.05)
+            self._spin()
         return False
+
+    def _spin(self) -> None:
+        self._executor.spin_once(timeout_sec=0.05)
+        self._interrupts.check()
 
     def _now(self) -> int:
         return int(self._node.get_clock().now().nanoseconds)

@@ -17,6 +17,7 @@ from pred_core.bag.writer import BagWriter
 from pred_core.errors import InputError, PredError
 from pred_core.plant.live.slot import SlotConfig
 from pred_core.types import Array
+from pred_ros.commands import Interrupts
 from pred_ros.processes import Children, free_domain, node_command, node_environment
 from pred_ros.reroute_faults import Fault
 from pred_ros.reroute_record import NS, Record
@@ -133,9 +134,9 @@ def run(job: Job, show: Show) -> Record:
     gap = float(str(job.nodes["plant"].get("gap", SlotConfig.gap)))
     record = Record(SlotConfig(gap=gap), job.goal)
     ended: BaseException | None = None
-    with _variables(environment), BagWriter(job.out / BAG) as writer:
+    with _variables(environment), BagWriter(job.out / BAG) as writer, Interrupts() as interrupts:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        watch = Watch(record, writer, job.camera)
+        watch = Watch(record, writer, job.camera, interrupts)
         try:
             with Children(environment, job.out / "log") as children:
                 loop = Loop(job, children, watch)

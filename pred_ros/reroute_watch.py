@@ -37,6 +37,7 @@ from pred_core.bag.writer import BagWriter
 from pred_core.errors import InputError
 from pred_core.plant.live.success import judge_passage
 from pred_ros import convert, planner_messages, qos
+from pred_ros.commands import Interrupts
 from pred_ros.reroute_faults import GONE
 from pred_ros.reroute_record import NS, PlanSeen, Record, Said, View
 
@@ -49,11 +50,12 @@ ANSWER, AGAIN = 120.0, 8.0  # [s] on the wall for a service, and until it is ask
 
 
 class Watch:
-    """Spin it from one thread. Nothing of the truth goes into the bag."""
+    """Spin it from one thread; there it raises KeyboardInterrupt. Nothing of the truth goes into the bag."""
 
-    def __init__(self, record: Record, writer: BagWriter, camera: str | None):
+    def __init__(self, record: Record, writer: BagWriter, camera: str | None, interrupts: Interrupts):
         """camera: whose pictures are kept, None: none."""
         self.record, self._writer, self._camera = record, writer, camera
+        self._interrupts = interrupts
         self._heard: dict[str, int] = {}  # node -> [ns] its newest diagnostics
         self.node = rclpy.create_node("watch")
         self._executor = SingleThreadedExecutor()
@@ -83,6 +85,7 @@ class Watch:
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0.0:
             self._executor.spin_once(timeout_sec=left)
+            self._interrupts.check()
 
     def close(self) -> None:
         """Leave the graph."""
@@ -108,6 +111,7 @@ class Watch:
                 if client.service_is_ready() and (answer is None or time.monotonic() - asked > AGAIN):
                     answer, asked = client.call_async(request), time.monotonic()
                 self._executor.spin_once(timeout_sec=0.05)
+                self._interrupts.check()
             raise InputError(f"{service} does not answer within {ANSWER:g} s")
         finally:
             self.node.destroy_client(client)

@@ -31,13 +31,14 @@ from pred_core.config import setting
 from pred_core.errors import ConfigError, PredError
 from pred_core.track.estimate import Estimate, Prior
 from pred_core.track.settings import TrackerSettings, make_tracker, parse_cameras, parse_fixtures
-from pred_core.track.tracker import HEARD, Tracker
+from pred_core.track.tracker import Tracker
 from pred_ros import convert, qos, shell
 from pred_ros.camera_pairs import NO_PICTURES, CameraPairs
 from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.shell import REFUSAL_SHOWN, Shell
 
 SILENT = 1.0  # [s] without a complete picture before a camera counts as dead
+HEARD = 2.0  # [s] for which a gripper that is there is waited for: whether it is closed is said once a second
 OLD = 2.0  # [s] since the newest particles before they are not of now, whatever the pictures do
 WAITING = "waiting"
 NEWEST = "newest particles"
@@ -253,6 +254,9 @@ class TrackerNode(Shell):
 
     def _add_grip(self, tracker: Tracker, pose: PoseFrame, closed: NDArray[np.bool_]) -> None:
         tracker.add_grip(pose.stamp, pose.position, pose.rotation, closed)
+        if not self._gripped and self._published >= 0 and closed.any():  # begun without it: its ends are by chance
+            tracker.reset()
+            self.diagnostics.count("searched anew: the gripper was heard late")
         self._gripped = self._gripped or len(closed) > 0
 
     def _waits(self) -> bool:

@@ -20,6 +20,7 @@ from pred_core.bag.writer import BagWriter
 from pred_core.plant.live.slot import SlotConfig
 from pred_core.plant.live.success import Passage
 from pred_ros import reroute
+from pred_ros.commands import Interrupts
 from pred_ros.reroute_faults import FAULTS, GONE
 from pred_ros.reroute_record import PlanSeen, Record, Said
 from pred_ros.reroute_verdict import Verdict, judge
@@ -126,7 +127,7 @@ def test_a_node_without_diagnostics_is_said_to_be_gone_until_it_is_back(tmp_path
     record = Record(SlotConfig(), np.zeros((1, 3)))
     with own_domain(), BagWriter(tmp_path / "run.mcap") as writer:
         rclpy.init()
-        watch = Watch(record, writer, None)
+        watch = Watch(record, writer, None, Interrupts())
         try:
             for tenth in range(101):
                 stamp = Time(sec=tenth // 10, nanosec=tenth % 10 * 10**8)

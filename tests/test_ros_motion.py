@@ -19,6 +19,7 @@ from test_arm_node import DOWN, HOME, World, arm_world
 
 from pred_core.arm.approach import TimedPoses, with_approach
 from pred_core.arm.guard import Mode
+from pred_ros.commands import Interrupts
 
 BEGIN = HOME + (0.0, 0.06, 0.02)
 REST = 0.4  # [s]
@@ -99,6 +100,21 @@ def executed_alone(*arguments: str) -> tuple[int, str, str]:
     """`pred_motion` without an arm node."""
     done = subprocess.run([sys.executable, "-m", "pred_ros.motion", *arguments], capture_output=True, text=True)
     return done.returncode, done.stdout, done.stderr.strip().splitlines()[-1]
+
+
+def test_an_interrupt_waits_until_nobody_is_in_the_client_library() -> None:
+    """Raised in the conversion of a message it came out as a RuntimeError. After it, Ctrl-C is as it was."""
+    before = signal.getsignal(signal.SIGINT)
+    with Interrupts() as interrupts:
+        for _ in range(2):
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)
+            with pytest.raises(KeyboardInterrupt):
+                interrupts.check()
+            interrupts.check()
+    assert signal.getsignal(signal.SIGINT) is before
+    with pytest.raises(KeyboardInterrupt), Interrupts():
+        signal.raise_signal(signal.SIGINT)  # nobody has checked: it is not lost
 
 
 def test_an_interrupt_stops_the_arm(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ from pred_ros import convert, qos, tracker_node
 from pred_ros.tracker_node import TrackerNode
 
 ERROR, WARN, OK = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
+HEARD_LATE = "searched anew: the gripper was heard late"
 START = 5_000_000_000  # [ns]
 NAMES = ("cam0", "cam1")
 CLOSED = np.array([True])
@@ -177,6 +178,24 @@ def test_a_gripper_that_is_there_is_waited_for(rig: Rig, monkeypatch: pytest.Mon
     assert not rig.frames
     rig.until_found()
     away = np.linalg.norm(rig.frames[0].position - rig.scene.gripper, axis=-1)
+    assert away[0] < away[-1]
+
+
+def test_a_gripper_that_is_heard_late_turns_the_line(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Begun without it, the far end can be the first; then it speaks, and the held end is the first from then on."""
+    monkeypatch.setattr(tracker_node, "HEARD", 0.0)
+    monkeypatch.setattr(rig, "close", lambda: None)
+    monkeypatch.setattr(rig, "hold", lambda stamp: None)
+    monkeypatch.setattr(rig, "until_held", lambda: None)
+    rig.until_found()
+    away = np.linalg.norm(rig.frames[-1].position - rig.scene.gripper, axis=-1)
+    assert away[0] > away[-1] and rig.bench.node.diagnostics.counter(HEARD_LATE) == 0
+    monkeypatch.undo()
+    before = len(rig.frames)
+    rig.all(rig.frames[-1].stamp + STEP)
+    rig.bench.until(lambda: rig.bench.node.diagnostics.counter(HEARD_LATE) == 1, "the gripper's pose")
+    rig.show_until(lambda: len(rig.frames) > before + 3, NAMES)
+    away = np.linalg.norm(rig.frames[-1].position - rig.scene.gripper, axis=-1)
     assert away[0] < away[-1]
 
 
