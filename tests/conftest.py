@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 # One thread a process: the numbers do not depend on it and the machine is not oversubscribed.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# Begun in the background of a script, it and what it starts would ignore an interrupt, which tests send.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import pytest
 import torch
