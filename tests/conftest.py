@@ -11,9 +11,6 @@ from typing import TYPE_CHECKING
 # One thread a process: the numbers do not depend on it and the machine is not oversubscribed.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# Begun in the background of a script, it and what it starts would ignore an interrupt, which tests send.
-signal.signal(signal.SIGINT, signal.default_int_handler)
-
 import pytest
 import torch
 
@@ -21,6 +18,8 @@ if TYPE_CHECKING:
     from hidden_world import Answers
 
 torch.set_num_threads(1)
+# Begun in the background of a script, it and what it starts would ignore an interrupt, which tests send.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ANSWERS = "hidden_answers"
 DRAWN = pytest.StashKey[str]()
