@@ -71,6 +71,7 @@ class PlantNode(Shell):
 
     NAME: ClassVar[str] = "plant"
     CONFIG: ClassVar[type] = PlantConfig
+    PICTURES: ClassVar[bool] = True
 
     def __init__(self) -> None:
         super().__init__()

@@ -79,6 +79,7 @@ class PlayerNode(Shell):
 
     NAME: ClassVar[str] = "player"
     CONFIG: ClassVar[type] = PlayerConfig
+    PICTURES: ClassVar[bool] = True
 
     def __init__(self) -> None:
         super().__init__()

@@ -17,15 +17,13 @@ from types import TracebackType
 
 from pred_core.errors import ConfigError, nearest
 from pred_ros import shared_memory
-from pred_ros.resources import fastdds_profile
+from pred_ros.dead_ports import unicast_port
 
 # A node started with this variable ends when its parent is gone, however that ended.
 END_WITH_PARENT = "PRED_END_WITH_PARENT"
 NODES = ("player", "plant", "tracker", "predictor", "evaluator", "planner", "arm")
 POLITE = 4.0  # [s] between SIGINT and SIGKILL
 
-# DDS-RTPS 9.6.2.3: port of the first participant's discovery = 7400 + 250 domain + 10.
-_PORT_BASE, _PORTS_A_DOMAIN, _FIRST_UNICAST = 7400, 250, 10
 _draws = itertools.count()
 
 # The ROS wheels re-execute the interpreter once to set LD_LIBRARY_PATH and mark it done with this variable;
@@ -34,10 +32,9 @@ _BOOTSTRAP_GUARD = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 
 
 def node_environment(domain: int | None = None) -> dict[str, str]:
-    """Environment of a node: Fast DDS with the large shared-memory profile; with `domain`, this machine only."""
+    """Environment of a node, on Fast DDS; with `domain`, on this machine only."""
     environment = {k: v for k, v in os.environ.items() if k != _BOOTSTRAP_GUARD}
     environment.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
-    environment.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(fastdds_profile()))
     environment["PYTHONUNBUFFERED"] = "1"
     environment[END_WITH_PARENT] = "1"
     if domain is not None:
@@ -56,7 +53,7 @@ def free_domain() -> int:
         domain = 1 + (os.getpid() * 13 + next(_draws) + k) % 100
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
-                probe.bind(("", _PORT_BASE + _PORTS_A_DOMAIN * domain + _FIRST_UNICAST))
+                probe.bind(("", unicast_port(domain, 0)))
             except OSError:
                 continue
             return domain

@@ -17,6 +17,7 @@ from pred_core.bag.writer import BagWriter
 from pred_core.errors import InputError, PredError
 from pred_core.plant.live.slot import SlotConfig
 from pred_core.types import Array
+from pred_ros import transport
 from pred_ros.commands import Interrupts
 from pred_ros.processes import Children, free_domain, node_command, node_environment
 from pred_ros.reroute_faults import Fault
@@ -29,7 +30,7 @@ STALLED = 120.0  # [s] on the wall in which the cell's time must go on
 HOLD = 1.0  # [s] of the cell's time that the rope must stay in the slot
 STILL = 3.0  # [s] after the last step of a fault that a resting arm is watched, where the task cannot go on
 EVERY = 5.0  # [s] on the wall between two lines of progress
-SHARED = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "RMW_IMPLEMENTATION", "FASTRTPS_DEFAULT_PROFILES_FILE")
+SHARED = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "RMW_IMPLEMENTATION")
 LOOK = 0.05  # [s] on the wall between two looks at processes and verdict
 
 Show = Callable[[str], None]
@@ -134,7 +135,8 @@ def run(job: Job, show: Show) -> Record:
     gap = float(str(job.nodes["plant"].get("gap", SlotConfig.gap)))
     record = Record(SlotConfig(gap=gap), job.goal)
     ended: BaseException | None = None
-    with _variables(environment), BagWriter(job.out / BAG) as writer, Interrupts() as interrupts:
+    shared = {name: environment[name] for name in SHARED} | transport.variables(False, environment)
+    with _variables(shared), BagWriter(job.out / BAG) as writer, Interrupts() as interrupts:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         watch = Watch(record, writer, job.camera, interrupts)
         try:
@@ -209,9 +211,9 @@ def progress(record: Record, factor: float) -> str:
 
 @contextmanager
 def _variables(wanted: Mapping[str, str]) -> Iterator[None]:
-    """The variables of the nodes for this process too, as long as the run lasts."""
-    before = {name: os.environ.get(name) for name in SHARED}
-    os.environ.update({name: wanted[name] for name in SHARED})
+    """These variables for this process, as long as the run lasts."""
+    before = {name: os.environ.get(name) for name in wanted}
+    os.environ.update(wanted)
     try:
         yield
     finally:

@@ -26,11 +26,6 @@ def sample_pictures() -> Path:
     return _find("bags", "sample_cameras.mcap") / "sample_cameras.mcap"
 
 
-def fastdds_profile() -> Path:
-    """The Fast DDS profile with a large shared-memory segment."""
-    return config_folder() / "fastdds.xml"
-
-
 def _find(folder: str, witness: str) -> Path:
     prefixes = [Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if p]
     shares = [p / "share" / "pred_ros" for p in (*prefixes, Path(sys.prefix))]

@@ -29,7 +29,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from pred_core.errors import ConfigError, PredError
-from pred_ros import parameters
+from pred_ros import dead_ports, parameters, transport
 from pred_ros.diagnostics import ERROR, OK, WARN, Diagnostics
 from pred_ros.processes import END_WITH_PARENT
 
@@ -63,6 +63,7 @@ class Shell(LifecycleNode):
 
     NAME: ClassVar[str]
     CONFIG: ClassVar[type]
+    PICTURES: ClassVar[bool] = False  # it sends or takes pictures
 
     def __init__(self) -> None:
         super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True)
@@ -231,8 +232,10 @@ def run(node_class: type[Shell], args: list[str] | None = None) -> int:
         signal.signal(number, lambda received, _: asked.append(received))
     node: Shell | None = None
     try:
+        os.environ.update(transport.variables(node_class.PICTURES))
         _begin(node_class.NAME, args)
-        node = node_class()
+        with dead_ports.avoided():
+            node = node_class()
         return _spin(node, asked)
     except PredError as error:
         print(f"{node_class.NAME}: {error}", file=sys.stderr, flush=True)

@@ -61,6 +61,7 @@ class TrackerNode(Shell):
 
     NAME: ClassVar[str] = "tracker"
     CONFIG: ClassVar[type] = TrackerNodeConfig
+    PICTURES: ClassVar[bool] = True
 
     def __init__(self) -> None:
         super().__init__()

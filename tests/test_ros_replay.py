@@ -163,7 +163,6 @@ def test_a_child_starts_the_ros_bootstrap_anew(monkeypatch: pytest.MonkeyPatch) 
     environment = node_environment(42)
     assert "_ROS_WHEELS_BOOTSTRAP_COMPLETE" not in environment
     assert environment["ROS_DOMAIN_ID"] == "42" and environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
-    assert Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
 
 
 def test_measured_data_come_first_and_the_sample_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -20,7 +20,6 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("twin", description="twin folder"),
             DeclareLaunchArgument("held", default_value="", description="particle:gripper pairs, '0:0 1:1'"),
             DeclareLaunchArgument("namespace", default_value=""),
-            SetEnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", str(CONFIG / "fastdds.xml")),
             Node(
                 package="pred_ros",
                 executable="predictor",

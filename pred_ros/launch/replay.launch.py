@@ -4,7 +4,7 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
@@ -35,7 +35,6 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("factor", default_value="1.0", description="speed, times real time"),
             DeclareLaunchArgument("out", default_value="out/live", description="folder of the report"),
             DeclareLaunchArgument("rviz", default_value="false"),
-            SetEnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", str(CONFIG / "fastdds.xml")),
             *(
                 Node(package="pred_ros", executable=name, name=name, parameters=[shared, parameters], output="screen")
                 for name, parameters in own.items()

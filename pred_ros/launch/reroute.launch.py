@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -24,7 +24,6 @@ def generate_launch_description() -> LaunchDescription:
         [
             DeclareLaunchArgument("twin", default_value=str(CONFIG / "twins" / "cell_rope")),
             DeclareLaunchArgument("settings", default_value=str(CONFIG / "plan" / "slot.yaml")),
-            SetEnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", str(CONFIG / "fastdds.xml")),
             *(
                 Node(package="pred_ros", executable=name, name=name, parameters=[shared, more], output="screen")
                 for name, more in {**own, "arm": {}}.items()
