@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -136,7 +134,7 @@ def run(job: Job, show: Show) -> Record:
     record = Record(SlotConfig(gap=gap), job.goal)
     ended: BaseException | None = None
     shared = {name: environment[name] for name in SHARED} | transport.variables(False, environment)
-    with _variables(shared), BagWriter(job.out / BAG) as writer, Interrupts() as interrupts:
+    with transport.added(shared), BagWriter(job.out / BAG) as writer, Interrupts() as interrupts:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         watch = Watch(record, writer, job.camera, interrupts)
         try:
@@ -207,18 +205,3 @@ def progress(record: Record, factor: float) -> str:
         f"   {record.seconds(record.now):5.1f} s (x {factor:.2f})  {len(record.plans)} plans, {goal} mm from the goal"
         f"{', THROUGH' if record.success else ''}  |  {said}"
     )
-
-
-@contextmanager
-def _variables(wanted: Mapping[str, str]) -> Iterator[None]:
-    """These variables for this process, as long as the run lasts."""
-    before = {name: os.environ.get(name) for name in wanted}
-    os.environ.update(wanted)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name)
-            else:
-                os.environ[name] = value

@@ -232,9 +232,8 @@ def run(node_class: type[Shell], args: list[str] | None = None) -> int:
         signal.signal(number, lambda received, _: asked.append(received))
     node: Shell | None = None
     try:
-        os.environ.update(transport.variables(node_class.PICTURES))
-        _begin(node_class.NAME, args)
-        with dead_ports.avoided():
+        with transport.added(transport.variables(node_class.PICTURES)), dead_ports.avoided():
+            _begin(node_class.NAME, args)
             node = node_class()
         return _spin(node, asked)
     except PredError as error:

@@ -29,6 +29,7 @@ from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
 from pred_core.errors import ConfigError
+from pred_core.track import line_tracker
 from pred_core.track.settings import parse_cameras, parse_fixtures
 from pred_core.types import CameraFrame
 from pred_ros import convert, qos, tracker_node
@@ -183,6 +184,13 @@ def test_a_gripper_that_is_there_is_waited_for(rig: Rig, monkeypatch: pytest.Mon
 
 def test_a_gripper_that_is_heard_late_turns_the_line(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """Begun without it, the far end can be the first; then it speaks, and the held end is the first from then on."""
+    first_end = line_tracker.from_first_end
+
+    def far_end(path: Any, grips: Any, config: Any) -> Any:
+        hanging = path if path[0, 2] < path[-1, 2] else path[::-1]
+        return first_end(path, grips, config) if len(grips) else hanging
+
+    monkeypatch.setattr(line_tracker, "from_first_end", far_end)
     monkeypatch.setattr(tracker_node, "HEARD", 0.0)
     monkeypatch.setattr(rig, "close", lambda: None)
     monkeypatch.setattr(rig, "hold", lambda stamp: None)
