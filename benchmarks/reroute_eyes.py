@@ -12,7 +12,7 @@ from pred_core.bag.clouds import PointFrame
 from pred_core.cli.plant_collect import TrackerWatcher
 from pred_core.dynamics import Dynamics
 from pred_core.estimate.estimator import Estimator
-from pred_core.estimate.grasped import placed_in_gripper
+from pred_core.estimate.grasped import Grasp
 from pred_core.estimate.measurement import Measurement
 from pred_core.plan.latency import Observation
 from pred_core.plant.live.cell import Cell
@@ -101,7 +101,9 @@ class CameraEyes:
             if found is not None:
                 x, v = (torch.as_tensor(a, dtype=torch.float32) for a in (found.position, found.velocity))
                 levers = {self._row[id]: place for id, place in self._twin.meta.levers}
-                one.start(moment.stamp, placed_in_gripper(State(x, v, self._held), grip, levers), grip)
+                state = State(x, v, self._held)
+                grasp = Grasp(self._twin.body, state, grip, levers)
+                one.start(moment.stamp, grasp.taken(state, grip, found.track, one.config.slipped), grip, grasp)
                 self._started = True
 
     def _measured(self, points: PointFrame) -> Measurement:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import yaml
 
 from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
+from pred_core.errors import DivergenceError
 from pred_core.estimate.config import EstimatorConfig
 from pred_core.live.following import Follower
 from pred_core.live.prediction_records import Prediction, Rules
@@ -39,7 +41,12 @@ def seen(stamp: int, index: np.ndarray | None = None, up: float = 0.0) -> PointF
 
 
 def follow(
-    follower: Follower, ticks: range, every: int = 5, delay: int = 0, index: np.ndarray | None = None
+    follower: Follower,
+    ticks: range,
+    every: int = 5,
+    delay: int = 0,
+    index: np.ndarray | None = None,
+    tracks: Callable[..., PointFrame] = seen,
 ) -> list[Prediction]:
     """Poses at every tick, tracks captured at every `every`-th (0: none), `delay` ticks late."""
     given: list[Prediction] = []
@@ -49,13 +56,25 @@ def follow(
             pose = PoseFrame(stamp, np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0, 0.0]]))
             follower.add_pose(pose, CLOSED)
             if every and tick >= delay and (tick - delay) % every == 0:
-                follower.add_points(seen(stamp - delay * TICK, index))
+                follower.add_points(tracks(stamp - delay * TICK, index))
             given += list(follower.advance())
     return given
 
 
 def follower(rules: Rules | None = None, **config: float) -> Follower:
     return Follower(load_dynamics(TWIN), TWIN.body, {0: 0, 1: 0}, rules or Rules(), config=EstimatorConfig(**config))
+
+
+def clamped() -> Follower:
+    """It knows where in the jaws the held ones sit."""
+    return Follower(load_dynamics(TWIN), TWIN.body, {0: 0, 1: 0}, Rules(), levers=dict(TWIN.meta.levers))
+
+
+def reversed_tracks(stamp: int, index: np.ndarray | None = None) -> PointFrame:
+    """The line begun at its far end: particle 0 is where the last one is."""
+    right = seen(stamp, index)
+    index = right.id.astype(int)
+    return PointFrame(stamp, hanging()[::-1][index], right.id, right.confidence, None)
 
 
 def test_it_starts_and_gives_a_state_at_each_period_and_correction() -> None:
@@ -137,3 +156,33 @@ def test_a_loop_starts_a_new_run() -> None:
     follow(one, range(90))
     given = follow(one, range(60))
     assert one.counts.runs == 2 and one.counts.jumps == 1 and given[-1].stamp <= BEGIN + 60 * TICK
+
+
+@pytest.mark.parametrize("hidden", [(), (0, 1)], ids=["all seen", "what should be held is not"])
+@pytest.mark.parametrize("before", [0, 60], ids=["from the start", "later"])
+def test_tracks_with_the_ends_reversed_neither_tear_the_body_nor_lose_the_grip_for_good(
+    before: int, hidden: tuple[int, ...]
+) -> None:
+    """A line that is held at one end cannot have it half a metre away: it is free, until the tracks are right again."""
+    one, index = clamped(), np.setdiff1d(np.arange(COUNT), hidden)
+    follow(one, range(before))
+    wrong = follow(one, range(before, before + 100), index=index, tracks=reversed_tracks)
+    assert one.condition().tally.let_go == 2 and "2 particles" in one.condition().trouble()
+    right = follow(one, range(before + 100, before + 500))
+    for given in (*wrong, *right):
+        assert np.ptp(given.state.position.numpy(), axis=0).max() < 0.75, "0.70 m of rope"
+    assert right[-1].state.held[:3].tolist() == [0, 0, -1] and "particles" not in one.condition().trouble()
+    assert np.abs(right[-1].state.position.numpy() - hanging()).max() < 0.01
+
+
+def test_what_may_not_be_sent_is_a_divergence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Readers refuse a body of more than 10 m, so such a state ends the run; it starts anew."""
+    one = follower()
+    follow(one, range(60))
+    after = one._estimator.state
+    far = after.replace(position=after.position * torch.tensor([1.0, 1.0, 100.0]))
+    monkeypatch.setattr(one._estimator, "step", lambda stamp, grip: far)
+    with pytest.raises(DivergenceError, match="m across"):
+        follow(one, range(60, 70), every=0)
+    monkeypatch.undo()
+    assert follow(one, range(70, 130)) and one.counts.runs == 2

@@ -11,6 +11,7 @@ from pred_core.errors import InputError
 from pred_core.estimate.config import EstimatorConfig
 from pred_core.estimate.filter import Correction, ErrorFilter, Evidence
 from pred_core.estimate.gate import NoiseScale, believable
+from pred_core.estimate.grasped import Grasp
 from pred_core.estimate.health import Health, Tally
 from pred_core.estimate.history import NS, SAME, History, Node
 from pred_core.estimate.lengths import Lengths
@@ -34,6 +35,7 @@ class Estimator:
         self._dynamics, self._body = dynamics, body
         self.scale = NoiseScale(self.starter.modes, self.config)
         self._history = History(self.config.history)
+        self._grasp: Grasp | None = None
         self._errors: ErrorFilter | None = None
         self._lengths: Lengths | None = None
         self._modes: dict[bytes, Modes] = {}
@@ -51,8 +53,21 @@ class Estimator:
         """The newest state, with the memory of its Dynamics."""
         return self._history.newest.state
 
-    def start(self, stamp: int, state: State, grip: Grip) -> None:
-        """Begin at `stamp` [ns] with a state (N, 3) without memory; `grip` is the gripper then."""
+    @property
+    def missing(self) -> int:
+        """Particles that a closed gripper should hold and that are free, because the tracks had them elsewhere."""
+        node = self._history.newest
+        return 0 if self._grasp is None else self._grasp.missing(node.state, node.grip)
+
+    def start(self, stamp: int, state: State, grip: Grip, grasp: Grasp | None = None) -> None:
+        """Begin at `stamp` [ns] with a state (N, 3) without memory; `grip` is the gripper then.
+
+        grasp: what is to be held when it must begin anew; None: what the state holds.
+        """
+        self._grasp = grasp or Grasp(self._body, state, grip, {})
+        self._begin(stamp, state, grip)
+
+    def _begin(self, stamp: int, state: State, grip: Grip) -> None:
         self._history = History(self.config.history)
         self._history.add(Node(stamp, self._dynamics.start(state, grip), grip))
         self._errors = None
@@ -96,6 +111,8 @@ class Estimator:
         innovation = seen.position[usable] - self._history.position_at(at, seen.stamp)[index]
         evidence = Evidence(index, innovation, self.scale.value * seen.variance(self.config)[usable])
         used = believable(self._errors, evidence, self.config.gate)
+        if used.sum() <= (1.0 - self.config.lost_share) * len(used):
+            used[:] = False  # where most contradict the state, the few that agree do by chance, and would crumple it
         self._note(seen.stamp, used, elapsed, evidence)
         found = self.starter.find() if self.health.lost(seen.stamp) else None
         if found is not None:
@@ -131,21 +148,19 @@ class Estimator:
         self._again(after)
 
     def _begin_anew(self, at: int, found: Start) -> None:
-        """Replace node `at` and all after it; what is held keeps its place in the jaws, unless seen elsewhere."""
+        """Replace node `at` and all after it; what is to be held is in the jaws, unless the tracks contradict it."""
         node, *after = self._history.cut(at)
-        held = (node.state.held >= 0).numpy()
-        place = node.state.position.double().numpy()
+        assert self._grasp is not None
         position = found.position - found.velocity * ((found.stamp - node.stamp) / NS)
-        gone = held & (np.linalg.norm(found.track - place, axis=1) > self.config.slipped)  # false where not seen
-        position[held & ~gone] = place[held & ~gone]
         state = State(
             position=torch.as_tensor(position, dtype=torch.float32),
             velocity=torch.as_tensor(found.velocity, dtype=torch.float32),
-            held=node.state.held.masked_fill(torch.from_numpy(gone), -1),
+            held=node.state.held,
         )
-        self.start(node.stamp, state, node.grip)
+        state = self._grasp.taken(state, node.grip, found.track, self.config.slipped)
+        self._begin(node.stamp, state, node.grip)
         self.tally.lost += 1
-        self.tally.let_go += int(gone.sum())
+        self.tally.let_go += int(((node.state.held >= 0) & (state.held < 0)).sum())
         self._again(after)
 
     def _again(self, nodes: list[Node]) -> None:

@@ -23,6 +23,7 @@ class Condition:
     lost: Outcome | None  # of the tracks that made it start anew, the last time
     noise: float  # errors of the tracks, times what their confidence says
     tally: Tally
+    missing: int = 0  # particles that a closed gripper should hold, and that the tracks have elsewhere
 
     def trouble(self) -> str:
         """What is wrong, in a line; empty if nothing is."""
@@ -38,11 +39,13 @@ class Condition:
             return f"{told}: no state is given until they are back"
         if self.lost is not None and self.stamp - self.lost.stamp < ANEW_SHOWN * NS:
             contrary = int((~self.lost.used).sum())
-            gone = f", {self.tally.let_go} particles are not in the gripper any more" if self.tally.let_go else ""
+            gone = f", {self.missing} particles are not in the gripper any more" if self.missing else ""
             return (
                 f"was lost at {self.lost.stamp / NS:.3f} s, {contrary} of {len(self.lost.used)} tracks were far from"
                 f" it; started anew from the tracks ({self.tally.lost} times so far){gone}"
             )
+        if self.missing:
+            return f"the tracks have {self.missing} particles elsewhere that the gripper should hold: they are free"
         return ""
 
     def shown(self) -> dict[str, str]:
@@ -52,6 +55,7 @@ class Condition:
             "tracks rejected": f"{t.rejected} of {t.used + t.rejected}",
             "frames too late": str(t.late),
             "started anew when lost": str(t.lost),
+            "held particles that were elsewhere": str(t.let_go),
             "track noise, times expected": f"{self.noise:.2f}",
         }
         if n is not None:

@@ -14,7 +14,7 @@ from pred_core.dynamics import Dynamics
 from pred_core.errors import DivergenceError
 from pred_core.estimate.config import EstimatorConfig
 from pred_core.estimate.estimator import Estimator
-from pred_core.estimate.grasped import Levers, placed_in_gripper
+from pred_core.estimate.grasped import Grasp, Levers
 from pred_core.estimate.measurement import Measurement, Outcome
 from pred_core.estimate.starter import Start
 from pred_core.live.condition import Condition
@@ -45,6 +45,7 @@ class Follower(Run):
         """levers: particle id -> place in its gripper's frame [m], of those that are held (`TwinMeta.levers`)."""
         super().__init__(dynamics, body.id, held, rules, calibration)
         self._estimator = Estimator(dynamics, body, config)
+        self._body = body
         self._row = {int(id): k for k, id in enumerate(self._ids)}
         self._levers = {self._row[id]: place for id, place in (levers or {}).items() if id in self._row}
         self._found: tuple[Time, Start] | None = None
@@ -57,7 +58,7 @@ class Follower(Run):
         one, stamp = self._estimator, self._time[1]
         return Condition(
             stamp, one.health.level(stamp), one.health.blind_for(stamp), one.config.stop_after, self._newest,
-            self._lost, float(np.sqrt(one.scale.value)), one.tally,
+            self._lost, float(np.sqrt(one.scale.value)), one.tally, one.missing if self.running else 0,
         )  # fmt: skip
 
     def waiting(self) -> str:
@@ -135,7 +136,10 @@ class Follower(Run):
             velocity=torch.as_tensor(found.velocity, dtype=torch.float32),
             held=torch.as_tensor(held, dtype=torch.int32),
         )
-        self._estimator.start(time[1], placed_in_gripper(state, grip, self._levers), grip)
+        grasp = Grasp(self._body, state, grip, self._levers)
+        begun = grasp.taken(state, grip, found.track, self._estimator.config.slipped)
+        self._estimator.tally.let_go += int(((state.held >= 0) & (begun.held < 0)).sum())
+        self._estimator.start(time[1], begun, grip, grasp)
         self._state, self._time, self._found = self._estimator.state, time, None
         assert self._before is not None
         self._moved = grip, self._before

@@ -7,6 +7,7 @@ from a measured start; `following.py`: corrected by the tracks).
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -16,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from pred_core.bag.align import slerp
-from pred_core.bag.clouds import PointFrame
+from pred_core.bag.clouds import LARGEST_EXTENT, PointFrame
 from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
 from pred_core.calibration import Calibration
@@ -235,12 +236,15 @@ class Run:
         return self._finite(lambda: self._dynamics.step(state, grip), stamp)
 
     def _finite(self, simulate: Callable[[], State], stamp: int) -> State:
-        """A state at `stamp` that must be finite. Raises: DivergenceError; the run is over then."""
+        """A state at `stamp` that must be finite, and no larger than what may be sent. Raises: DivergenceError; the run
+        is over then.
+        """
         try:
             after = simulate()
-            if bool(torch.isfinite(after.position).all() and torch.isfinite(after.velocity).all()):
+            extent = float((after.position.amax(dim=0) - after.position.amin(dim=0)).max())
+            if extent <= LARGEST_EXTENT and bool(torch.isfinite(after.velocity).all()):
                 return after
-            reason = "not finite"
+            reason = f"{extent:.3g} m across" if math.isfinite(extent) else "not finite"
         except DivergenceError as error:
             reason = str(error)
         self._state = None
