@@ -28,6 +28,7 @@ from pred_core.live.laps import Laps, Time
 from pred_core.live.prediction_records import Counts, Pose, Prediction, Rules, grip_of
 from pred_core.types import Grip, State
 
+LARGEST_SPEED = 100.0  # [m/s] of a particle in a robot's reach; springs that tear bring thousands
 ON_GRID = 0.25  # periods; where poses come once a period, one this close to the next step is the step
 EXACT = 1e-3  # periods; else only one this close is: between others the gripper is interpolated
 PACE = 0.1  # periods by which the time between poses may differ from one, where they come once a period
@@ -236,15 +237,18 @@ class Run:
         return self._finite(lambda: self._dynamics.step(state, grip), stamp)
 
     def _finite(self, simulate: Callable[[], State], stamp: int) -> State:
-        """A state at `stamp` that must be finite, and no larger than what may be sent. Raises: DivergenceError; the run
-        is over then.
+        """A state at `stamp` that must be finite, no larger than what may be sent, and not in an explosion.
+
+        Raises: DivergenceError; the run is over then.
         """
         try:
             after = simulate()
             extent = float((after.position.amax(dim=0) - after.position.amin(dim=0)).max())
-            if extent <= LARGEST_EXTENT and bool(torch.isfinite(after.velocity).all()):
+            speed = float(after.velocity.norm(dim=-1).max())
+            if extent <= LARGEST_EXTENT and speed <= LARGEST_SPEED:
                 return after
-            reason = f"{extent:.3g} m across" if math.isfinite(extent) else "not finite"
+            finite = math.isfinite(extent) and math.isfinite(speed)
+            reason = f"{extent:.3g} m across, up to {speed:.3g} m/s" if finite else "not finite"
         except DivergenceError as error:
             reason = str(error)
         self._state = None
