@@ -31,7 +31,7 @@ from pred_core.dynamics import Dynamics
 from pred_core.errors import DivergenceError
 from pred_core.estimate.config import EstimatorConfig
 from pred_core.estimate.estimator import Estimator
-from pred_core.estimate.grasped import Grasp
+from pred_core.estimate.grasped import grasp_of
 from pred_core.estimate.measurement import Measurement
 from pred_core.estimate.starter import Start, Starter
 from pred_core.evaluate.bootstrap import bootstrap_interval
@@ -70,7 +70,7 @@ def begin(twin: Twin, world: World, tracks: list[Measurement], config: Estimator
     grip = world.grip(found.stamp * 1e-9)
     state = State(torch.as_tensor(found.position, dtype=torch.float32),
                   torch.as_tensor(found.velocity, dtype=torch.float32), held)  # fmt: skip
-    grasp = Grasp(twin.body, state, grip, dict(twin.meta.levers))
+    grasp = grasp_of(twin.body, state, grip, dict(twin.meta.levers))
     return found, grasp.taken(state, grip, found.track, config.slipped), grip
 
 

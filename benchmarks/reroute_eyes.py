@@ -12,7 +12,7 @@ from pred_core.bag.clouds import PointFrame
 from pred_core.cli.plant_collect import TrackerWatcher
 from pred_core.dynamics import Dynamics
 from pred_core.estimate.estimator import Estimator
-from pred_core.estimate.grasped import Grasp
+from pred_core.estimate.grasped import grasp_of
 from pred_core.estimate.measurement import Measurement
 from pred_core.plan.latency import Observation
 from pred_core.plant.live.cell import Cell
@@ -102,7 +102,7 @@ class CameraEyes:
                 x, v = (torch.as_tensor(a, dtype=torch.float32) for a in (found.position, found.velocity))
                 levers = {self._row[id]: place for id, place in self._twin.meta.levers}
                 state = State(x, v, self._held)
-                grasp = Grasp(self._twin.body, state, grip, levers)
+                grasp = grasp_of(self._twin.body, state, grip, levers)
                 one.start(moment.stamp, grasp.taken(state, grip, found.track, one.config.slipped), grip, grasp)
                 self._started = True
 

@@ -187,3 +187,18 @@ def test_a_torn_body_is_not_given(grown: float, faster: float, got: str, monkeyp
         follow(one, range(60, 70), every=0)
     monkeypatch.undo()
     assert follow(one, range(70, 130)) and one.counts.runs == 2
+
+
+def test_a_gripper_that_lets_go_and_takes_another_place_is_not_said_to_miss_the_first() -> None:
+    """Told to hold the end, it opens, moves to the middle and closes there: what it holds then stays held anew."""
+    one = clamped()
+    follow(one, range(60))
+    middle = hanging()[COUNT // 2]
+    with torch.no_grad():
+        for tick in range(60, 100):
+            height = np.array([[0.0, 0.0, 1.0]]) if tick < 70 else middle[None]
+            pose = PoseFrame(BEGIN + tick * TICK, height, np.array([[1.0, 0.0, 0.0, 0.0]]))
+            one.add_pose(pose, np.array([tick < 65 or tick > 75]))
+            list(one.advance())
+    held = one._estimator.state.held
+    assert held[:2].tolist() == [-1, -1] and one.condition().missing == 0

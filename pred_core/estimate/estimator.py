@@ -11,7 +11,7 @@ from pred_core.errors import InputError
 from pred_core.estimate.config import EstimatorConfig
 from pred_core.estimate.filter import Correction, ErrorFilter, Evidence
 from pred_core.estimate.gate import NoiseScale, believable
-from pred_core.estimate.grasped import Grasp
+from pred_core.estimate.grasped import Grasp, grasp_of
 from pred_core.estimate.health import Health, Tally
 from pred_core.estimate.history import NS, SAME, History, Node
 from pred_core.estimate.lengths import Lengths
@@ -56,15 +56,14 @@ class Estimator:
     @property
     def missing(self) -> int:
         """Particles that a closed gripper should hold and that are free, because the tracks had them elsewhere."""
-        node = self._history.newest
-        return 0 if self._grasp is None else self._grasp.missing(node.state, node.grip)
+        return 0 if self._grasp is None else self._grasp.missing(self.state)
 
     def start(self, stamp: int, state: State, grip: Grip, grasp: Grasp | None = None) -> None:
         """Begin at `stamp` [ns] with a state (N, 3) without memory; `grip` is the gripper then.
 
         grasp: what is to be held when it must begin anew; None: what the state holds.
         """
-        self._grasp = grasp or Grasp(self._body, state, grip, {})
+        self._grasp = grasp or grasp_of(self._body, state, grip, {})
         self._begin(stamp, state, grip)
 
     def _begin(self, stamp: int, state: State, grip: Grip) -> None:
@@ -77,6 +76,8 @@ class Estimator:
 
     def step(self, stamp: int, grip: Grip) -> State:
         """The state one period later, at `stamp` [ns]; `grip` is the gripper then. Raises: DivergenceError."""
+        assert self._grasp is not None
+        self._grasp = self._grasp.kept(grip)
         after = self._dynamics.step(self.state, grip)
         self._history.add(Node(stamp, after, grip))
         return after
@@ -157,6 +158,7 @@ class Estimator:
             velocity=torch.as_tensor(found.velocity, dtype=torch.float32),
             held=node.state.held,
         )
+        self._grasp = self._grasp.joined(self._body, node.state, node.grip)
         state = self._grasp.taken(state, node.grip, found.track, self.config.slipped)
         self._begin(node.stamp, state, node.grip)
         self.tally.lost += 1

@@ -14,7 +14,7 @@ from pred_core.dynamics import Dynamics
 from pred_core.errors import DivergenceError
 from pred_core.estimate.config import EstimatorConfig
 from pred_core.estimate.estimator import Estimator
-from pred_core.estimate.grasped import Grasp, Levers
+from pred_core.estimate.grasped import Levers, grasp_of
 from pred_core.estimate.measurement import Measurement, Outcome
 from pred_core.estimate.starter import Start
 from pred_core.live.condition import Condition
@@ -136,7 +136,7 @@ class Follower(Run):
             velocity=torch.as_tensor(found.velocity, dtype=torch.float32),
             held=torch.as_tensor(held, dtype=torch.int32),
         )
-        grasp = Grasp(self._body, state, grip, self._levers)
+        grasp = grasp_of(self._body, state, grip, self._levers)
         begun = grasp.taken(state, grip, found.track, self._estimator.config.slipped)
         self._estimator.tally.let_go += int(((state.held >= 0) & (begun.held < 0)).sum())
         self._estimator.start(time[1], begun, grip, grasp)
