@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,7 +16,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray
 
 from pred_core.types import State
-from pred_ros import convert, qos
+from pred_ros import convert, qos, transport
 from pred_ros.processes import free_domain
 from pred_ros.shell import Shell
 
@@ -70,16 +69,8 @@ class Bench:
 @contextmanager
 def own_domain() -> Iterator[None]:
     """A ROS domain of this test, on this machine only."""
-    before = {k: os.environ.get(k) for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
-    os.environ.update(ROS_DOMAIN_ID=str(free_domain()), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
-    try:
+    with transport.added({"ROS_DOMAIN_ID": str(free_domain()), transport.RANGE: "LOCALHOST"}):
         yield
-    finally:
-        for key, value in before.items():
-            if value is None:
-                os.environ.pop(key)
-            else:
-                os.environ[key] = value
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import signal
 import socket
@@ -26,9 +27,13 @@ pytestmark = pytest.mark.skipif(not SHARED_MEMORY.is_dir(), reason=f"no {SHARED_
 
 
 def segments(pid: int) -> set[Path]:
-    """Segments of Fast DDS that a process holds; ports belong to all."""
-    paths = {Path(line.split()[-1]) for line in Path(f"/proc/{pid}/maps").read_text().splitlines()}
-    return {p for p in paths if p.name.startswith("fastrtps_") and not p.name.startswith("fastrtps_port")}
+    """Segments of Fast DDS that a process owns: it has their locks open. Those of others it only reads."""
+    opened = []
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # closed in the meantime
+            opened.append(entry.readlink())
+    locks = [p for p in opened if p.parent == SHARED_MEMORY and p.name.endswith("_el") and "port" not in p.name]
+    return {p.with_name(p.name.removesuffix("_el")) for p in locks}
 
 
 def started(children: Children, node: str, parameters: dict[str, object], words: str) -> subprocess.Popen[bytes]:
