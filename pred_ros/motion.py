@@ -2,7 +2,8 @@
 
 The arm node must run with `source: plan`, be enabled, and allow the motion's speed, acceleration and length. The object
 is in the jaws. The arm goes straight and slowly to where the motion begins, rests there as long as the file says,
-and moves. What the arm refuses, or a fault on the way, ends this with the arm's own line; Ctrl-C stops the arm.
+and moves. What the arm refuses, or a fault on the way, ends this with the arm's own line. Whatever ends it, Ctrl-C too,
+while the arm moves stops the arm.
 """
 
 from __future__ import annotations
@@ -28,15 +29,16 @@ from pred_core.arm.plan_file import read_motion
 from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_POSE
 from pred_core.errors import ConfigError, InputError
-from pred_ros import convert, qos
+from pred_ros import convert, dead_ports, qos, transport
 from pred_ros.arm_messages import PLAN
 from pred_ros.commands import Interrupts, run_command
-from pred_ros.diagnostics import OK
+from pred_ros.diagnostics import ERROR, OK, WARN
 
-PATIENCE = 10.0  # [s] for the arm node to be there
+PATIENCE = 25.0  # [s] for the arm node to be there; after one of us was killed it can take 20 s until it is found
 AHEAD = 0.3  # [s] between sending and the beginning
 ANSWER = 1.0  # [s] in which a refusal comes
 ARRIVED = 0.02  # [m] from the last pose
+REFUSED = " refused"  # how the arm's counters of what it refused end
 SHOWN = 1.0  # [s] between two lines of progress
 
 
@@ -57,9 +59,10 @@ def go(args: argparse.Namespace) -> int:
     frame, motion, rest = read_motion(args.file, args.gripper)
     if frame != WORLD:
         raise InputError(f"{args.file}: another frame", got=repr(frame), allowed=repr(WORLD))
-    with Interrupts() as interrupts:
+    with Interrupts() as interrupts, transport.added(transport.variables(pictures=False)):
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        sender = Sender(interrupts)
+        with dead_ports.avoided():
+            sender = Sender(interrupts)
         try:
             sender.execute(motion, args.approach, rest)
         finally:
@@ -78,6 +81,7 @@ class Sender:
         self._executor.add_node(self._node)
         self._pose: PoseFrame | None = None
         self._said: tuple[bytes, str] | None = None
+        self._refusals = 0  # of plans and commands, as the arm counts them
         self._node.create_subscription(PoseArray, GRIPPER_POSE, self._on_pose, qos.poses_live())
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self._stop = self._node.create_client(Trigger, "/arm/stop")
@@ -90,10 +94,15 @@ class Sender:
 
     def execute(self, motion: TimedPoses, speed: float, rest: float) -> None:
         """To the beginning with `speed` [m/s], `rest` [s], the motion. Raises: InputError with what went wrong."""
-        if not self._until(lambda: self._pose is not None and self._out.get_subscription_count() > 0, PATIENCE):
-            missing = "plan/trajectory" if self._pose is not None else GRIPPER_POSE
+        heard = {
+            GRIPPER_POSE: lambda: self._pose is not None,
+            "the arm's /diagnostics": lambda: self._said is not None,  # what it has refused before is not about this
+            f"a reader of {PLAN}": lambda: self._out.get_subscription_count() > 0,
+        }
+        if not self._until(lambda: all(there() for there in heard.values()), PATIENCE):
             raise InputError(
-                f"no arm node: nobody {'reads' if self._pose is not None else 'writes'} {missing}",
+                "no arm node",
+                got="no " + ", no ".join(name for name, there in heard.items() if not there()),
                 next_step="Start one: arm --ros-args -p arm:=..., then call /arm/enable",
             )
         pose = self._pose
@@ -103,13 +112,14 @@ class Sender:
         seconds = float(whole.times[-1])
         print(f"{seconds:.1f} s, {seconds - float(motion.times[-1] - motion.times[0]):.1f} s of it to the beginning")
         begin = self._now() + round(AHEAD * 1e9)
-        self._said = None
+        self._said, refusals = None, self._refusals
         self._out.publish(_message(begin, whole))
         try:
             self._follow(begin, seconds)
-        except KeyboardInterrupt:  # the arm would go on to the end of the plan
-            self._stop.call_async(Trigger.Request())
-            self._until(lambda: self._said is not None and self._said[0] != OK, ANSWER)
+        except (KeyboardInterrupt, InputError):  # the arm would go on to the end of the plan
+            if self._refusals == refusals:
+                stopped = self._stop.call_async(Trigger.Request())
+                self._until(stopped.done, ANSWER)
             raise
         off = float(np.linalg.norm(self._place() - whole.position[-1]))
         if off > ARRIVED:
@@ -118,11 +128,16 @@ class Sender:
         print("done")
 
     def _follow(self, begin: int, seconds: float) -> None:
-        end, shown = begin + round((seconds + ANSWER) * 1e9), 0.0
+        """Until the end. A refusal and an error end it; a warning, which may be of before, is shown."""
+        end, shown, warned, refusals = begin + round((seconds + ANSWER) * 1e9), 0.0, "", self._refusals
         while self._now() < end:
             self._spin()
-            if self._said is not None and self._said[0] != OK:
-                raise InputError(f"arm: {self._said[1]}")
+            level, line = self._said or (OK, "")
+            if level == ERROR or self._refusals > refusals:
+                raise InputError(f"arm: {line}")
+            if level == WARN and line != warned:
+                warned = line
+                print(f"arm: {line}", flush=True)
             gone = (self._now() - begin) * 1e-9
             if gone - shown >= SHOWN:
                 shown = gone
@@ -157,6 +172,8 @@ class Sender:
         for status in message.status:
             if status.name.rsplit("/", 1)[-1] == "arm":
                 self._said = (status.level, status.message)
+                counts = [int(v.value) for v in status.values if v.key.endswith(REFUSED) and v.value.isdigit()]
+                self._refusals = max(self._refusals, sum(counts))
 
 
 def _message(stamp: int, poses: TimedPoses) -> MultiDOFJointTrajectory:

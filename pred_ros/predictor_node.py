@@ -223,6 +223,9 @@ class PredictorNode(Shell):
         poses, points = (qos.points_complete(),) * 2 if queued else (qos.poses_live(), qos.points_live())
         self._inputs = [
             self.create_subscription(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed, poses),
+            self.create_subscription(
+                UInt8MultiArray, GRIPPER_CLOSED, self._on_closed_before, qos.latched(), event_callbacks=qos.unnoticed()
+            ),
             self.create_subscription(PoseArray, GRIPPER_POSE, self._on_pose, poses),
             self.create_subscription(PointCloud2, TRACKER_POINTS, self._on_points, points),
         ]
@@ -230,6 +233,11 @@ class PredictorNode(Shell):
 
     def _on_closed(self, message: UInt8MultiArray) -> None:
         self.take(GRIPPER_CLOSED, lambda: self._set_closed(convert.message_to_closed(message)))
+
+    def _on_closed_before(self, message: UInt8MultiArray) -> None:
+        """What was said once and for all before this node began; what is said now comes to `_on_closed`."""
+        if self._closed is None:
+            self._on_closed(message)
 
     def _on_pose(self, message: PoseArray) -> None:
         self.take(GRIPPER_POSE, lambda: self._post(self._add_pose, convert.message_to_pose(message), self._closed))

@@ -7,6 +7,7 @@ writer that keeps fewer messages than a reader asks for loses them; their memory
 
 from __future__ import annotations
 
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 LIVE_DEPTH = 5
@@ -54,6 +55,11 @@ def images() -> QoSProfile:
 def latched(depth: int = 1) -> QoSProfile:
     """What a late reader must still get: gripper/closed, episode marks, camera poses, goals."""
     return _profile(depth, DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def unnoticed() -> SubscriptionEventCallbacks:
+    """For a reader that is there besides another one: that a writer does not serve it is nothing to warn of."""
+    return SubscriptionEventCallbacks(use_default_callbacks=False)
 
 
 def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:

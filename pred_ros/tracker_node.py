@@ -108,6 +108,7 @@ class TrackerNode(Shell):
                 callback = functools.partial(self.take, f"{name}/{topic}", functools.partial(add, name))
                 self._listen(message_type, f"{name}/{topic}", callback, profile)
         closed = self._listen(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed, qos.points_live())
+        self._listen(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed_before, qos.latched(), qos.unnoticed())
         self._grippers = [closed, self._listen(PoseArray, GRIPPER_POSE, self._on_pose, qos.poses_live())]
         if self.config.prior:
             self._listen(PointCloud2, STATE_POINTS, self._on_state, qos.points_live())
@@ -174,8 +175,10 @@ class TrackerNode(Shell):
             return WARN, f"tracking, but no particle's confidence is above {SURE:g}: is the object in view?"
         return OK, "tracking"
 
-    def _listen(self, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any) -> Subscription:
-        self._inputs.append(self.create_subscription(kind, topic, callback, profile))
+    def _listen(
+        self, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any, events: Any = None
+    ) -> Subscription:
+        self._inputs.append(self.create_subscription(kind, topic, callback, profile, event_callbacks=events))
         return self._inputs[-1]
 
     def _on_image(self, name: str, kind: str, message: Image) -> None:
@@ -184,6 +187,11 @@ class TrackerNode(Shell):
 
     def _on_closed(self, message: UInt8MultiArray) -> None:
         self.take(GRIPPER_CLOSED, self._set_closed, message)
+
+    def _on_closed_before(self, message: UInt8MultiArray) -> None:
+        """What was said once and for all before this node began; what is said now comes to `_on_closed`."""
+        if not len(self._closed):
+            self._on_closed(message)
 
     def _set_closed(self, message: UInt8MultiArray) -> None:
         self._closed = convert.message_to_closed(message)

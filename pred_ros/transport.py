@@ -16,7 +16,7 @@ from pred_ros.resources import config_folder
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-CHOICE = (PROFILES, "FASTDDS_DEFAULT_PROFILES_FILE", TRANSPORTS, "ROS_STATIC_PEERS")
+CHOICE = (PROFILES, "FASTDDS_DEFAULT_PROFILES_FILE", TRANSPORTS, "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
 
 
 def variables(pictures: bool, environment: Mapping[str, str] = os.environ) -> dict[str, str]:
@@ -28,7 +28,7 @@ def variables(pictures: bool, environment: Mapping[str, str] = os.environ) -> di
         return {}
     if pictures:
         return {PROFILES: str(config_folder() / "fastdds.xml")}
-    if environment.get(RANGE) == "LOCALHOST":  # there the client library adds shared memory to what is chosen
+    if environment.get(RANGE, "").upper() == "LOCALHOST":  # there the client library adds shared memory
         return {PROFILES: str(config_folder() / "fastdds_local.xml"), RANGE: "SYSTEM_DEFAULT"}
     return {TRANSPORTS: "UDPv4"}
 

@@ -15,6 +15,7 @@ import yaml
 
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from test_arm_node import DOWN, HOME, World, arm_world
 
 from pred_core.arm.approach import TimedPoses, with_approach
@@ -100,6 +101,29 @@ def executed_alone(*arguments: str) -> tuple[int, str, str]:
     """`pred_motion` without an arm node."""
     done = subprocess.run([sys.executable, "-m", "pred_ros.motion", *arguments], capture_output=True, text=True)
     return done.returncode, done.stdout, done.stderr.strip().splitlines()[-1]
+
+
+def test_a_warning_does_not_end_it(tmp_path: Path) -> None:
+    """Whoever watches the motion must not leave while the arm moves: at the edge of its box it goes on."""
+    edge = HOME[0] + WAY - 0.002  # the motion's far end is 2 mm outside, which the arm accepts, and holds there
+    with arm_world(lifetime=30.0, x_high=edge) as world:
+        assert world.enable().success
+        code, out, line = executed(world, str(motion_file(tmp_path / "next_motion.yaml")), "--approach", "0.1")
+        assert (code, line) == (0, ""), (out, line)
+        assert "held at a limit" in out and world.place() == pytest.approx(BEGIN, abs=1e-3)
+
+
+def test_an_error_on_the_way_stops_the_arm(tmp_path: Path) -> None:
+    file = motion_file(tmp_path / "next_motion.yaml")
+    with arm_world(lifetime=30.0) as world:
+        assert world.enable().success
+        wrong = DiagnosticArray(status=[DiagnosticStatus(name="/arm", level=DiagnosticStatus.ERROR, message="broken")])
+        out = world.bench.world.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        timer = world.bench.world.create_timer(0.1, lambda: world.guard.mode is Mode.MOVING and out.publish(wrong))
+        code, _, line = executed(world, str(file), "--approach", "0.02")
+        timer.cancel()
+        assert code == 2 and "broken" in line
+        world.bench.until(lambda: world.guard.mode is Mode.FAULT and world.guard.at_rest, "it has stopped")
 
 
 def test_an_interrupt_waits_until_nobody_is_in_the_client_library() -> None:

@@ -21,6 +21,7 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from rclpy.qos import qos_profile_sensor_data
 from ros_bench import Bench, bench_of, own_domain
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import Trigger
 from track_scenes import LENGTH, STEP, TURN, HangingRope
 
@@ -180,6 +181,29 @@ def test_a_gripper_that_is_there_is_waited_for(rig: Rig, monkeypatch: pytest.Mon
     rig.until_found()
     away = np.linalg.norm(rig.frames[0].position - rig.scene.gripper, axis=-1)
     assert away[0] < away[-1]
+
+
+def test_a_gripper_that_said_once_that_it_is_closed_is_heard(scene: HangingRope) -> None:
+    """Latched before the node began, and never again."""
+    with own_domain():
+        rclpy.init()
+        try:
+            driver = rclpy.create_node("driver")
+            driver.create_publisher(UInt8MultiArray, GRIPPER_CLOSED, qos.latched()).publish(
+                convert.closed_to_message(CLOSED)
+            )
+            node: Any = TrackerNode()
+            node.trigger_configure()
+            node.trigger_activate()
+            end = time.monotonic() + 20.0
+            while not len(node._closed):
+                assert time.monotonic() < end, "never heard"
+                rclpy.spin_once(node, timeout_sec=0.05)
+            node.stop()
+            node.destroy_node()
+            driver.destroy_node()
+        finally:
+            rclpy.try_shutdown()
 
 
 def test_a_gripper_that_is_heard_late_turns_the_line(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

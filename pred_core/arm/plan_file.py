@@ -33,7 +33,7 @@ def read_motion(path: Path, gripper: int = 0) -> tuple[str, TimedPoses, float]:
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         raise ConfigError(
             f"{path}: not a motion of gripper {gripper}",
-            got=repr(error),
+            got=f"no {error}" if isinstance(error, KeyError) else str(error),
             allowed="trajectory: frame_id, points of time_from_start and transforms",
             next_step="Give the next_motion.yaml of pred diagnose",
         ) from error

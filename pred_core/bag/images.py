@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pred_core.bag.clouds import LARGEST_COORDINATE
 from pred_core.bag.wire import check_frame, make_header, message_type
 from pred_core.errors import BagError, ConfigError
 
@@ -80,6 +81,13 @@ def read_camera_pose(message: Any, where: str) -> Array:
     norm = float(np.linalg.norm(values[3:]))
     if not np.isfinite(values).all() or abs(norm - 1.0) > 1e-3:
         raise BagError(f"{where}: not a pose", got=values.tolist(), allowed="finite metres and a unit quaternion")
+    if np.abs(values[:3]).max() > LARGEST_COORDINATE:
+        raise BagError(
+            f"{where}: implausibly far away, are these millimetres?",
+            got=f"{np.abs(values[:3]).max():.4g} m from the origin",
+            allowed=f"at most {LARGEST_COORDINATE:g} m",
+            next_step="Write metres",
+        )
     w, x, y, z = values[3:] / norm
     pose = np.eye(4)
     pose[:3, :3] = [

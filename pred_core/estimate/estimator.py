@@ -36,6 +36,7 @@ class Estimator:
         self.scale = NoiseScale(self.starter.modes, self.config)
         self._history = History(self.config.history)
         self._grasp: Grasp | None = None
+        self.missing = 0  # particles that a closed gripper should hold and that are free: the tracks had them elsewhere
         self._errors: ErrorFilter | None = None
         self._lengths: Lengths | None = None
         self._modes: dict[bytes, Modes] = {}
@@ -53,11 +54,6 @@ class Estimator:
         """The newest state, with the memory of its Dynamics."""
         return self._history.newest.state
 
-    @property
-    def missing(self) -> int:
-        """Particles that a closed gripper should hold and that are free, because the tracks had them elsewhere."""
-        return 0 if self._grasp is None else self._grasp.missing(self.state)
-
     def start(self, stamp: int, state: State, grip: Grip, grasp: Grasp | None = None) -> None:
         """Begin at `stamp` [ns] with a state (N, 3) without memory; `grip` is the gripper then.
 
@@ -70,6 +66,7 @@ class Estimator:
         self._history = History(self.config.history)
         self._history.add(Node(stamp, self._dynamics.start(state, grip), grip))
         self._errors = None
+        self.missing = 0 if self._grasp is None else self._grasp.missing(state)
         self._hold(state)
         self._corrected = stamp
         self.health = Health(self.config, stamp)
@@ -80,6 +77,7 @@ class Estimator:
         self._grasp = self._grasp.kept(grip)
         after = self._dynamics.step(self.state, grip)
         self._history.add(Node(stamp, after, grip))
+        self.missing = self._grasp.missing(after)
         return after
 
     def correct(self, seen: Measurement) -> Outcome:

@@ -31,7 +31,6 @@ class GripperPath:
     def __init__(self) -> None:
         self._stamps: list[int] = []
         self._poses: list[tuple[Array, Array]] = []
-        self.closed: NDArray[np.bool_] = np.zeros(0, bool)
 
     def add(self, stamp: int, position: Array, rotation: Array) -> None:
         """Poses (G, 3) [m] and (G, 4) wxyz at `stamp` [ns]. Raises: InputError if not finite."""
@@ -47,8 +46,8 @@ class GripperPath:
             del self._stamps[0], self._poses[0]
 
     def expected(self, stamp: int, silent: float) -> bool:
-        """Whether poses of `stamp` [ns] are still to come: there are some, the newest less than `silent` [s] old."""
-        return bool(self._stamps) and (stamp - self._stamps[-1]) * 1e-9 < silent and self.at(stamp) is None
+        """Whether poses of `stamp` [ns] are still to come: the newest is less than `silent` [s] away from it."""
+        return bool(self._stamps) and abs(stamp - self._stamps[-1]) * 1e-9 < silent and self.at(stamp) is None
 
     def at(self, stamp: int, late: float = 0.1) -> tuple[Array, Array] | None:
         """Position (G, 3) and rotation matrices (G, 3, 3) at `stamp` [ns]: linear between poses, the newest one for
