@@ -71,6 +71,9 @@ def test_calibration_and_pose_through_the_wire() -> None:
         pose[:3, :3], pose[:3, 3] = turn, (0.1, -0.2, 0.9)
         made = images.make_camera_pose(7, pose[:3, 3], images.rotation_of(pose))
         assert images.read_camera_pose(decode(encode(made), images.POSE_STAMPED, "t"), "t") == pytest.approx(pose)
+    far = images.make_camera_pose(7, 1e3 * pose[:3, 3], images.rotation_of(pose))
+    with pytest.raises(BagError, match=r"millimetres\?; got 900 m from the origin"):
+        images.read_camera_pose(far, "t")
     made.header.frame_id = "map"
     with pytest.raises(BagError, match="frame_id"):
         images.read_camera_pose(made, "t")

@@ -211,6 +211,14 @@ def test_gripper_between_two_poses() -> None:
         path.add(200, np.full((1, 3), np.nan), quarter)
 
 
+def test_poses_are_awaited_only_near_their_time() -> None:
+    """A gripper whose clock is far ahead or behind keeps nobody waiting."""
+    path, still = GripperPath(), np.array([[1.0, 0.0, 0.0, 0.0]])
+    path.add(10_000_000_000, np.zeros((1, 3)), still)
+    assert [path.expected(s * 10**9, 1.0) for s in (1, 9, 10, 11, 1000)] == [False, False, False, False, False]
+    assert path.expected(9_500_000_000, 1.0) and path.expected(10_500_000_000, 1.0)
+
+
 def test_rope_is_found_and_followed(tracker: Tracker, scene: HangingRope) -> None:
     for k in range(8):
         scene.move(np.array([0.012, 0.006, 0.0]) * k)  # 0.2 m/s at 15 Hz
