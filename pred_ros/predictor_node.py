@@ -103,6 +103,7 @@ class PredictorNode(Shell):
         self._worker: Future[None] | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="prediction")
         self._inputs: list[Subscription] = []
+        self._latched: Subscription | None = None  # reader of what was said of the gripper before
         self._closed: NDArray[np.bool_] | None = None
         self._overload = ""
         self._stopping = False
@@ -159,7 +160,7 @@ class PredictorNode(Shell):
             self.destroy_subscription(subscription)
         for timer in (self._starter, self._watch):
             self.destroy_timer(timer)
-        self._inputs = []
+        self._inputs, self._latched = [], None
         self._stopping = True
         self._predictor.cancel()
         self._inbox.put(None)
@@ -179,6 +180,11 @@ class PredictorNode(Shell):
         """Judge ages and counters."""
         if self._worker is None:
             return
+        if self._inputs and self._latched is None and self._closed is None and qos.is_latched(self, GRIPPER_CLOSED):
+            self._latched = self.create_subscription(
+                UInt8MultiArray, GRIPPER_CLOSED, self._on_closed_before, qos.latched()
+            )
+            self._inputs.append(self._latched)
         for name in COUNTS_SHOWN:
             self.diagnostics.value(name, str(getattr(self._predictor.counts, name)))
         trouble = self._show_condition()
@@ -223,9 +229,6 @@ class PredictorNode(Shell):
         poses, points = (qos.points_complete(),) * 2 if queued else (qos.poses_live(), qos.points_live())
         self._inputs = [
             self.create_subscription(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed, poses),
-            self.create_subscription(
-                UInt8MultiArray, GRIPPER_CLOSED, self._on_closed_before, qos.latched(), event_callbacks=qos.unnoticed()
-            ),
             self.create_subscription(PoseArray, GRIPPER_POSE, self._on_pose, poses),
             self.create_subscription(PointCloud2, TRACKER_POINTS, self._on_points, points),
         ]

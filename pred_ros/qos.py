@@ -7,7 +7,7 @@ writer that keeps fewer messages than a reader asks for loses them; their memory
 
 from __future__ import annotations
 
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 LIVE_DEPTH = 5
@@ -57,9 +57,10 @@ def latched(depth: int = 1) -> QoSProfile:
     return _profile(depth, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def unnoticed() -> SubscriptionEventCallbacks:
-    """For a reader that is there besides another one: that a writer does not serve it is nothing to warn of."""
-    return SubscriptionEventCallbacks(use_default_callbacks=False)
+def is_latched(node: Node, topic: str) -> bool:
+    """Whether somebody who writes a topic keeps its last message for late readers; only they can be read so."""
+    writers = node.get_publishers_info_by_topic(topic)
+    return any(w.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for w in writers)
 
 
 def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:

@@ -108,7 +108,7 @@ class TrackerNode(Shell):
                 callback = functools.partial(self.take, f"{name}/{topic}", functools.partial(add, name))
                 self._listen(message_type, f"{name}/{topic}", callback, profile)
         closed = self._listen(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed, qos.points_live())
-        self._listen(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed_before, qos.latched(), qos.unnoticed())
+        self._latched: Subscription | None = None
         self._grippers = [closed, self._listen(PoseArray, GRIPPER_POSE, self._on_pose, qos.poses_live())]
         if self.config.prior:
             self._listen(PointCloud2, STATE_POINTS, self._on_state, qos.points_live())
@@ -142,6 +142,8 @@ class TrackerNode(Shell):
         """Judge ages: dead cameras, refused messages, whether the object is in view."""
         if self._worker is None:
             return
+        if self._latched is None and not len(self._closed) and qos.is_latched(self, GRIPPER_CLOSED):
+            self._latched = self._listen(UInt8MultiArray, GRIPPER_CLOSED, self._on_closed_before, qos.latched())
         self.diagnostics.value("pictures dropped, newer came", str(self._pairs.dropped))
         self.diagnostics.value("pictures that came too late", str(self._tracker.stale))
         self.diagnostics.value("pictures without their partner", str(self._pairs.unpaired))
@@ -175,10 +177,8 @@ class TrackerNode(Shell):
             return WARN, f"tracking, but no particle's confidence is above {SURE:g}: is the object in view?"
         return OK, "tracking"
 
-    def _listen(
-        self, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any, events: Any = None
-    ) -> Subscription:
-        self._inputs.append(self.create_subscription(kind, topic, callback, profile, event_callbacks=events))
+    def _listen(self, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any) -> Subscription:
+        self._inputs.append(self.create_subscription(kind, topic, callback, profile))
         return self._inputs[-1]
 
     def _on_image(self, name: str, kind: str, message: Image) -> None:
