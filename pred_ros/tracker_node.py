@@ -270,7 +270,7 @@ class TrackerNode(Shell):
 
     def _waits(self) -> bool:
         """A gripper that is there but was not heard yet is waited for: a line that begins without it keeps its ends."""
-        self._first = self.seconds() if self._first is None else self._first
+        self._first = self._first or self.seconds()  # 0: a simulated clock that has not been heard yet
         if self._gripped or self.seconds() - self._first > HEARD:
             return False
         return any(s.get_publisher_count() for s in self._grippers)
