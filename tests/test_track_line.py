@@ -20,6 +20,7 @@ from pred_core.track.grasp import GripperPath
 from pred_core.track.line_config import LineConfig
 from pred_core.track.line_fit import Cloud, LineFitConfig, fit_line
 from pred_core.track.line_start import LineStartConfig, find_line, resample
+from pred_core.track.line_tracker import LineTracker
 from pred_core.track.tracker import Tracker, TrackerConfig
 from pred_core.track.workspace import Workspace, inside_any
 from pred_core.types import Array, Box, Capsule, Sphere
@@ -209,6 +210,18 @@ def test_gripper_between_two_poses() -> None:
     assert path.at(-1) is None and path.at(200_000_000) is None
     with pytest.raises(InputError, match="not finite"):
         path.add(200, np.full((1, 3), np.nan), quarter)
+
+
+def test_a_line_whose_held_side_is_hidden_is_waited_for_but_not_for_ever() -> None:
+    """Begun from what is seen of it, its free end could be the nearer one to the gripper, and be the first for good."""
+    line, turn = LineTracker(CONFIG.line), np.eye(3)[None]
+    path = np.linspace([0.0, 0.0, 0.3], [0.0, 0.0, 0.0], 30)
+    closed, away, at = np.array([True]), (np.array([[0.0, 0.2, 0.0]]), turn), (np.array([[0.0, 0.05, 0.15]]), turn)
+    hidden = [line._is_half_seen(path, START + k * 250_000_000, away, closed) for k in range(6)]
+    assert hidden == [True] * 4 + [False] * 2
+    fresh = LineTracker(CONFIG.line)
+    assert not fresh._is_half_seen(path, START, at, closed), "held in the middle"
+    assert not fresh._is_half_seen(path, START, away, ~closed) and not fresh._is_half_seen(path, START, None, closed)
 
 
 def test_poses_are_awaited_only_near_their_time() -> None:

@@ -23,6 +23,7 @@ from pred_core.types import Array, Tracks
 
 GROWN = 0.03  # of the length: less is noise
 STILL = 0.005  # [m] standard deviation of the motion prior of a particle in view, beside its acceleration
+PATIENT = 1.0  # [s] for the held side of a line to be seen, before it is begun without
 UNSEEN = 0.1  # [m] the same of one that has not been in view for long, at most
 TRUST_SEEN, TRUST_UNSEEN = 0.7, 0.3  # share of the newest velocity of a particle that is in view, or is not
 BETTER = 0.02  # of the score: a fit from scratch that explains less than this more is no better
@@ -42,6 +43,7 @@ class LineTracker:
         self._bad_since: int | None = None
         self._pulled = False  # a gripper that it has slipped out of has pulled the nodes along
         self._found_at: int | None = None  # [ns] when its length was measured
+        self._hidden_since: int | None = None  # [ns] when a line was first found away from every closed gripper
         self._ends = LineEnds()
         self._closed: NDArray[np.bool_] = np.zeros(0, bool)
 
@@ -53,7 +55,20 @@ class LineTracker:
     def start(self, views: Sequence[View], stamp: int, poses: Poses | None, closed: NDArray[np.bool_]) -> list[View]:
         """Look for the line. Returns the part of each view that is on it; nothing if it is not found."""
         found = find_in(views, self.config.start)
-        return [] if found is None else self._begin(found, views, stamp, poses, closed, self.length > 0.0)
+        if found is None or (self.nodes is None and self._is_half_seen(found.path, stamp, poses, closed)):
+            return []
+        return self._begin(found, views, stamp, poses, closed, self.length > 0.0)
+
+    def _is_half_seen(self, path: Array, stamp: int, poses: Poses | None, closed: NDArray[np.bool_]) -> bool:
+        """No closed gripper is at what was found: the held side is hidden, and the nearer end may be the free one.
+
+        It is waited for, but not longer than PATIENT.
+        """
+        grips = closed_grips(poses, closed)
+        if not len(grips) or np.linalg.norm(path[:, None] - grips[None], axis=-1).min() <= self.config.bridge:
+            return False
+        self._hidden_since = stamp if self._hidden_since is None else self._hidden_since
+        return (stamp - self._hidden_since) * 1e-9 < PATIENT
 
     def _begin(
         self,
