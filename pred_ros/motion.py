@@ -71,6 +71,10 @@ def go(args: argparse.Namespace) -> int:
     return 0
 
 
+class RefusedError(InputError):
+    """The arm does not follow the plan."""
+
+
 class Sender:
     """Sends one plan to the arm node and watches it."""
 
@@ -112,14 +116,15 @@ class Sender:
         seconds = float(whole.times[-1])
         print(f"{seconds:.1f} s, {seconds - float(motion.times[-1] - motion.times[0]):.1f} s of it to the beginning")
         begin = self._now() + round(AHEAD * 1e9)
-        self._said, refusals = None, self._refusals
+        self._said = None
         self._out.publish(_message(begin, whole))
         try:
             self._follow(begin, seconds)
-        except (KeyboardInterrupt, InputError):  # the arm would go on to the end of the plan
-            if self._refusals == refusals:
-                stopped = self._stop.call_async(Trigger.Request())
-                self._until(stopped.done, ANSWER)
+        except RefusedError:
+            raise
+        except BaseException:  # the arm would go on to the end of the plan
+            stopped = self._stop.call_async(Trigger.Request())
+            self._until(stopped.done, ANSWER)
             raise
         off = float(np.linalg.norm(self._place() - whole.position[-1]))
         if off > ARRIVED:
@@ -128,12 +133,14 @@ class Sender:
         print("done")
 
     def _follow(self, begin: int, seconds: float) -> None:
-        """Until the end. A refusal and an error end it; a warning, which may be of before, is shown."""
+        """Until the end. Raises: RefusedError; InputError for an error. A warning, which may be of before, is shown."""
         end, shown, warned, refusals = begin + round((seconds + ANSWER) * 1e9), 0.0, "", self._refusals
         while self._now() < end:
             self._spin()
             level, line = self._said or (OK, "")
-            if level == ERROR or self._refusals > refusals:
+            if self._refusals > refusals and self._now() < begin + round(ANSWER * 1e9):  # later ones are of others
+                raise RefusedError(f"arm: {line}")
+            if level == ERROR:
                 raise InputError(f"arm: {line}")
             if level == WARN and line != warned:
                 warned = line
