@@ -102,6 +102,37 @@ def test_one_pose_from_the_future_ends_the_run_and_the_next_frames_start_one(ahe
     assert found[-20:] == list(range(10, 30)), "it predicts again within five frames"
 
 
+def test_a_topic_that_falls_back_alone_and_returns_has_begun_no_lap() -> None:
+    laps: Laps[None] = Laps(0.1)
+    for topic in "ab":
+        laps.take(topic, 20 * SECOND, None)
+    for stamp in (1.0, 1.05, 1.1):
+        assert laps.take("a", round(stamp * SECOND), None)[0][0][0] == 1
+    assert [laps.take(topic, 21 * SECOND, None)[0][0] for topic in "ab"] == [(0, 21 * SECOND)] * 2
+    assert [laps.take(topic, SECOND, None)[0][0] for topic in "ab"] == [(1, SECOND)] * 2, "and a loop is a loop"
+    with pytest.raises(InputError, match="ahead"):  # no way back to the lap before: the other topic has left it too
+        laps.take("a", 22 * SECOND, None)
+
+
+@pytest.mark.parametrize("behind", [0.5, 5.0, 20.0], ids=lambda s: f"{s} s")
+def test_one_cloud_from_the_past_costs_no_prediction(behind: float) -> None:
+    machine = predictor()
+    feed(machine, range(5))
+    machine.add_points(moved(4, -behind))
+    assert feed(machine, range(5, 60)) == list(range(5, 60))
+    assert machine.counts.dropped_frames == 1
+
+
+@pytest.mark.parametrize("behind", [0.5, 5.0, 20.0], ids=lambda s: f"{s} s")
+def test_one_pose_from_the_past_ends_the_run_and_the_next_frames_start_one(behind: float) -> None:
+    machine = predictor()
+    feed(machine, range(5))
+    wrong = pose(4)
+    machine.add_pose(PoseFrame(wrong.stamp - round(behind * SECOND), wrong.position, wrong.rotation), CLOSED)
+    assert list(machine.advance()) == []
+    assert feed(machine, range(5, 30))[-20:] == list(range(10, 30)), "it predicts again within five frames"
+
+
 def test_a_first_cloud_from_the_future_does_not_stop_the_start() -> None:
     machine = predictor()
     machine.add_points(moved(0, 3600.0))

@@ -23,6 +23,7 @@ class _Topic(Generic[T]):
     lap: int
     newest: int  # [ns]
     left_at: int | None = None  # [ns] its newest stamp when another topic began a newer lap
+    fell_from: int | None = None  # [ns] its newest stamp before it began a lap that no other topic has followed into
 
 
 class Laps(Generic[T]):
@@ -44,6 +45,9 @@ class Laps(Generic[T]):
         A time at or before an earlier one of the topic means that what came at later times was out of line.
         Raises: InputError for a late or repeated message, and for one far ahead, which is held back until the next.
         """
+        own = self._topics.get(topic)
+        if own is not None and self._is_back(own, stamp):
+            self._undo_lap(own)
         held = self._held.pop(topic, None)
         if held is not None and 0 < stamp - held[0] <= AHEAD:
             return [(self._place(topic, held[0]), held[1]), (self._place(topic, stamp), item)]
@@ -71,6 +75,7 @@ class Laps(Generic[T]):
         own = self._topics.get(topic)
         if own is None:
             own = self._topics[topic] = _Topic(self._last_lap(), stamp)
+            self._join(own)
         elif stamp > own.newest:
             if own.left_at is not None and stamp - own.left_at > AHEAD:
                 self._join(own)  # it went on so long without jumping back: the other topic's lap was no loop
@@ -93,10 +98,24 @@ class Laps(Generic[T]):
         return not others or any(abs(own.newest - t.newest) <= abs(t.newest - stamp) for t in others)
 
     def _begin_lap(self, own: _Topic[T]) -> None:
-        own.lap += 1
+        own.lap, own.fell_from = own.lap + 1, own.newest
         for other in self._topics.values():
             if other is not own and other.left_at is None:
                 other.left_at = other.newest
 
+    def _is_back(self, own: _Topic[T], stamp: int) -> bool:
+        """True if this topic alone began a lap and now goes on where it was before: no loop, but stamps out of line."""
+        if own.fell_from is None or not 0 < stamp - own.fell_from <= AHEAD:
+            return False
+        return stamp - own.newest > self._late
+
+    def _undo_lap(self, own: _Topic[T]) -> None:
+        own.lap, own.newest, own.fell_from = own.lap - 1, own.fell_from or own.newest, None
+        for other in self._topics.values():
+            if other.lap == own.lap:
+                other.left_at = None
+
     def _join(self, own: _Topic[T]) -> None:
         own.lap, own.left_at = self._last_lap(), None
+        for topic in self._topics.values():
+            topic.fell_from = None

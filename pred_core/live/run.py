@@ -164,9 +164,8 @@ class Run:
         if newest is not None and newest.lap == pose.lap:
             self._spacings.append(pose.pose.stamp - newest.pose.stamp)
         self._begin = min(self._begin, pose.time)
-        if pose.lap > self._pose_lap:
-            self._pose_lap = pose.lap
-            self.counts.jumps += 1
+        self.counts.jumps += pose.lap > self._pose_lap
+        self._pose_lap = pose.lap
         self._poses.append(pose)
         if self._state is None and len(self._poses) > MAX_WAITING:
             self._before = self._poses.popleft()
