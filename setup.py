@@ -10,6 +10,7 @@ ROOT = Path(__file__).parent
 
 # `ros2 run pred_ros NAME` and the script `NAME` of a pip install.
 NODES = ("player", "plant", "tracker", "predictor", "evaluator", "planner", "arm")
+COMMANDS = ("pred_replay", "pred_bringup", "pred_reroute", "pred_motion")
 
 CORE = [
     "cma",
@@ -77,11 +78,7 @@ setup(
     entry_points={
         "console_scripts": [
             "pred = pred_core.cli.main:main",
-            "pred_replay = pred_ros.replay:main",
-            "pred_bringup = pred_ros.bringup:main",
-            "pred_reroute = pred_ros.reroute:main",
-            "pred_motion = pred_ros.motion:main",
-            *(f"{name} = pred_ros.{name}_node:main" for name in NODES),
+            *(f"{name} = pred_ros.entry:{name}" for name in (*COMMANDS, *NODES)),
         ]
     },
 )

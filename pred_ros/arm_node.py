@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, NoReturn
 
@@ -65,8 +66,8 @@ class ArmConfig(GuardConfig):
     autostart: bool = setting(True, doc="configure and activate without a lifecycle manager")
 
 
-def make_arm(config: ArmConfig, patience: float = STARTING) -> Arm:
-    """The arm a configuration names; a plant that is started now has `patience` [s].
+def make_arm(config: ArmConfig, patience: float = STARTING, sleep: Callable[[float], None] = time.sleep) -> Arm:
+    """The arm a configuration names; a plant that is started now has `patience` [s], spent in `sleep`.
 
     Raises: ConfigError, or InputError if its controller does not answer.
     """
@@ -74,7 +75,7 @@ def make_arm(config: ArmConfig, patience: float = STARTING) -> Arm:
         home = np.array([config.home_x, config.home_y, config.home_z])
         return DryRunArm(home, orientation.DOWN if config.tool_down else orientation.UP)
     if config.arm == "plant":
-        return connect_plant(config.host or HOST, config.port, patience)
+        return connect_plant(config.host or HOST, config.port, patience, sleep)
     if not config.host:
         raise ConfigError(f"parameter 'host' is empty, arm '{config.arm}' needs one", next_step="-p host:=192.168.1.2")
     base = np.array([config.base_x, config.base_y, config.base_z])
@@ -108,7 +109,8 @@ class ArmNode(Shell):
         self._guard = Guard(config)
         self._follower = Follower(config, config.lifetime)
         if self._arm is None:
-            self._arm = make_arm(config)
+            self.report(OK, f"connecting to {config.arm}")
+            self._arm = make_arm(config, sleep=self.sleep)
         self._pose_out = self.create_publisher(PoseArray, GRIPPER_POSE, qos.points_complete())
         self._closed_out = self.create_publisher(UInt8MultiArray, GRIPPER_CLOSED, qos.latched())
         self._joints_out = self.create_publisher(JointState, "joint_states", 10)
@@ -124,7 +126,7 @@ class ArmNode(Shell):
         """Listen and tick; not armed yet."""
         if self._arm is None:  # active again after a pause
             self._guard, self._follower = Guard(self.config), Follower(self.config, self.config.lifetime)
-            self._arm = make_arm(self.config)
+            self._arm = make_arm(self.config, sleep=self.sleep)
         if self.config.source == "plan":
             self._heard: Any = self.create_subscription(
                 MultiDOFJointTrajectory, arm_messages.PLAN, self._on_plan, qos.plans()

@@ -21,6 +21,7 @@ class Diagnostics:
         self._lock = threading.Lock()
         self._level: bytes = OK
         self._message = "starting"
+        self._beside = ""  # a warning that holds whatever the status says
         self._counts: dict[str, int] = {}
         self._values: dict[str, str] = {}
         self._seen: dict[str, float] = {}  # [s] on `clock`
@@ -30,6 +31,12 @@ class Diagnostics:
         with self._lock:
             changed = (level, message) != (self._level, self._message)
             self._level, self._message = level, message
+            return changed
+
+    def beside(self, warning: str) -> bool:
+        """Set a warning that is shown beside the status, '' for none. Returns True if it changed."""
+        with self._lock:
+            changed, self._beside = warning != self._beside, warning
             return changed
 
     @property
@@ -77,9 +84,9 @@ class Diagnostics:
                 **self._values,
             }
             status = DiagnosticStatus(
-                level=self._level,
+                level=max(self._level, WARN) if self._beside else self._level,
                 name=self._name,
-                message=self._message,
+                message="; ".join(line for line in (self._message, self._beside) if line),
                 hardware_id="",
                 values=[KeyValue(key=k, value=v) for k, v in values.items()],
             )

@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from pred_core.bag import images
-from pred_core.bag.wire import camera_of
+from pred_core.bag.wire import camera_topics
 from pred_ros import convert, image_messages, qos
 
 
@@ -21,8 +21,9 @@ class PlayedPictures:
 
     def __init__(self, node: Node, topics: Sequence[str]):
         self._out: dict[str, Publisher] = {}
-        for topic in topics:
-            kind, profile = _kind(topic), qos.latched() if topic.endswith(f"/{images.POSE}") else qos.points_complete()
+        self._topics = camera_topics(topics)
+        for topic, (_, below) in self._topics.items():
+            kind, profile = _kind(below), qos.latched() if below == images.POSE else qos.points_complete()
             if kind is not None:
                 self._out[topic] = node.create_publisher(
                     Image if kind is CompressedImage else kind, images.raw_topic(topic), profile
@@ -38,13 +39,13 @@ class PlayedPictures:
 
         Raises: BagError if a picture cannot be unpacked; ConfigError without OpenCV.
         """
-        kind = _kind(topic)
+        camera, below = self._topics[topic]
+        kind = _kind(below)
         if kind is None:
             return False
         message: Any = deserialize_message(data, kind)
         if kind is CompressedImage:
-            camera = camera_of(topic) or ""
-            if topic.endswith(images.DEPTH_COMPRESSED):
+            if below == images.DEPTH_COMPRESSED:
                 message = image_messages.depth_to_message(camera, stamp, images.read_depth_compressed(message, topic))
             else:
                 message = image_messages.color_to_message(camera, stamp, images.read_color_compressed(message, topic))
@@ -53,10 +54,9 @@ class PlayedPictures:
         return True
 
 
-def _kind(topic: str) -> type | None:
-    name = topic.partition("/")[2]
-    if name in (images.COLOR_COMPRESSED, images.DEPTH_COMPRESSED):
+def _kind(below: str) -> type | None:
+    if below in (images.COLOR_COMPRESSED, images.DEPTH_COMPRESSED):
         return CompressedImage
-    if name in (images.COLOR, images.DEPTH):
+    if below in (images.COLOR, images.DEPTH):
         return Image
-    return {images.INFO: CameraInfo, images.POSE: PoseStamped}.get(name)
+    return {images.INFO: CameraInfo, images.POSE: PoseStamped}.get(below)

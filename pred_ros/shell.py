@@ -18,6 +18,7 @@ from typing import Any, ClassVar, NoReturn, Protocol, cast
 import rclpy
 import rclpy.utilities
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException, ParameterUninitializedException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -32,6 +33,7 @@ from pred_core.errors import ConfigError, PredError
 from pred_ros import dead_ports, parameters, transport
 from pred_ros.diagnostics import ERROR, OK, WARN, Diagnostics
 from pred_ros.processes import END_WITH_PARENT
+from pred_ros.surroundings import Surroundings
 
 BAD_INPUT = 2
 POLL = 0.05  # [s] how soon a signal or the end of the work is noticed
@@ -75,10 +77,13 @@ class Shell(LifecycleNode):
         parameters.follow(self, lambda: self.config, self._accept)
         self.exit_code: int | None = None
         self.bug: BaseException | None = None
+        self.asked: list[int] = []  # the signals that asked the process to end
         self._refusal = ""
         self.diagnostics = Diagnostics(self.get_fully_qualified_name(), self.seconds)
         self._diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._timer = self.create_timer(1.0, self._heartbeat)
+        self._surroundings = Surroundings(self)
+        self._lookout = self.create_timer(1.0, self._look_around, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._own = self._made()  # outlives a cleanup
 
     def setup(self) -> None:
@@ -127,6 +132,12 @@ class Shell(LifecycleNode):
         """[s] For ages and deadlines: simulated time where there is one, it may be slower than the wall's."""
         clock: Any = self.get_clock()
         return clock.now().nanoseconds * 1e-9 if clock.ros_time_is_active else time.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Sleep within `setup` or `start`. Raises: KeyboardInterrupt once a signal has asked the process to end."""
+        time.sleep(seconds)
+        if self.asked:
+            raise KeyboardInterrupt
 
     def take(self, topic: str, action: Callable[..., None], *values: Any) -> None:
         """Count a message of a topic and act on it; what cannot be used is refused, and the node goes on."""
@@ -221,6 +232,14 @@ class Shell(LifecycleNode):
         self.heartbeat()
         self.publish_diagnostics()
 
+    def _look_around(self) -> None:
+        """On the wall's time: simulated time may stand still."""
+        trouble = self._surroundings.trouble()
+        if self.diagnostics.beside(trouble):
+            if trouble:
+                self._log(WARN, trouble)
+            self.publish_diagnostics()
+
 
 def run(node_class: type[Shell], args: list[str] | None = None) -> int:
     """Run one node until it is done, fails, or receives SIGINT or SIGTERM. Returns the exit code.
@@ -235,7 +254,8 @@ def run(node_class: type[Shell], args: list[str] | None = None) -> int:
         with transport.added(transport.variables(node_class.PICTURES)), dead_ports.avoided():
             _begin(node_class.NAME, args)
             node = node_class()
-        return _spin(node, asked)
+            node.asked = asked
+        return _spin(node)
     except PredError as error:
         print(f"{node_class.NAME}: {error}", file=sys.stderr, flush=True)
         return BAD_INPUT
@@ -273,18 +293,18 @@ def main(node_class: type[Shell]) -> NoReturn:
     os._exit(code)
 
 
-def _spin(node: Shell, asked: list[int]) -> int:
+def _spin(node: Shell) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
         if node.config.autostart:
             for transition in (node.trigger_configure, node.trigger_activate):
-                if node.exit_code is None:
+                if node.exit_code is None and not node.asked:
                     transition()
                 if node.bug is not None:
                     raise node.bug
         parent = os.getppid() if END_WITH_PARENT in os.environ else None
-        while node.exit_code is None and not asked and parent in (None, os.getppid()):
+        while node.exit_code is None and not node.asked and parent in (None, os.getppid()):
             executor.spin_once(timeout_sec=POLL)
         return node.exit_code or 0
     finally:

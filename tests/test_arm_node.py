@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -243,7 +244,7 @@ class Measuring(DryRunArm):
 def test_poses_bear_the_time_of_their_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each measurement is published once, with its own stamp; a stamp of another clock is not believed."""
     arm = Measuring(time.time_ns)
-    monkeypatch.setattr(arm_node, "make_arm", lambda config: arm)
+    monkeypatch.setattr(arm_node, "make_arm", lambda config, sleep: arm)
     with arm_world() as world:
         world.poses.clear()
         world.wait(0.5)
@@ -259,7 +260,7 @@ def test_poses_bear_the_time_of_their_measurement(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize("how", ["protective stop", "connection lost"])
 def test_a_troubled_arm_is_stopped_at_once(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     arm = Troubled(HOME, DOWN)
-    monkeypatch.setattr(arm_node, "make_arm", lambda config: arm)
+    monkeypatch.setattr(arm_node, "make_arm", lambda config, sleep: arm)
     with arm_world() as world:
         world.bench.until(lambda: bool(world.joints), "joint_states")
         assert world.joints[-1].name == ["j1"] and world.joints[-1].position.tolist() == [0.5]
@@ -280,7 +281,7 @@ def test_reset_connects_again_to_a_lost_arm(monkeypatch: pytest.MonkeyPatch) -> 
     first, second = Troubled(HOME, DOWN), Troubled(HOME, DOWN)
     answers: list[Troubled] = [first]
 
-    def connect(config: ArmConfig, patience: float = 0.0) -> Troubled:
+    def connect(config: ArmConfig, patience: float = 0.0, sleep: object = None) -> Troubled:
         if not answers:
             raise InputError("plant: nobody at 127.0.0.1:7654")
         return answers.pop()
@@ -314,6 +315,21 @@ def test_a_configuration_that_cannot_be_ends_the_process_with_one_line() -> None
         assert done.returncode == code and word in done.stderr.strip().splitlines()[-1], done.stderr
 
 
+def test_ctrl_c_ends_an_arm_that_waits_for_its_plant() -> None:
+    process = subprocess.Popen(
+        node_command("arm", {"arm": "plant", "port": 9}), env=node_environment(free_domain()),
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        assert "connecting" in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=10)  # it would wait 30 s for a plant
+        assert process.returncode == 0 and said == ""
+    finally:
+        process.kill()
+
+
 class Remembering(DryRunArm):
     """A dry run that remembers its set-points."""
 
@@ -335,7 +351,7 @@ class Remembering(DryRunArm):
 
 def test_a_node_that_is_told_to_end_ramps_down_first(monkeypatch: pytest.MonkeyPatch) -> None:
     arm = Remembering()
-    monkeypatch.setattr(arm_node, "make_arm", lambda config: arm)
+    monkeypatch.setattr(arm_node, "make_arm", lambda config, sleep: arm)
     with arm_world() as world:
         assert world.enable().success
         world.send_plan(np.array([0.1, 0.0, 0.0]), 0.6)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -39,11 +41,20 @@ def test_every_node_module_has_an_entry_point_that_exists(arguments: dict[str, A
     assert nodes, "no *_node.py in pred_ros"
     assert nodes <= set(found)
     for name in nodes:
-        assert found[name] == f"pred_ros.{name}_node:main"
+        assert found[name] == f"pred_ros.entry:{name}"
     pytest.importorskip("rclpy", reason="the node modules need ROS")
     for target in found.values():
         module, function = target.split(":")
         assert callable(getattr(importlib.import_module(module), function)), target
+
+
+def test_ctrl_c_while_the_modules_load_ends_quietly() -> None:
+    code = (
+        "import importlib, signal; from pred_ros import entry; signal.signal(signal.SIGINT, signal.default_int_handler);"
+        "importlib.import_module = lambda module: signal.raise_signal(signal.SIGINT); entry.predictor()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_colcon_puts_scripts_where_ros2_run_looks(arguments: dict[str, Any]) -> None:

@@ -80,6 +80,22 @@ def test_it_is_causal_and_repeatable(tmp_path: Path) -> None:
     assert tracks["again"] == tracks["long"]
 
 
+def test_cameras_are_found_whatever_their_drivers_call_them(tmp_path: Path) -> None:
+    tracks = {}
+    for name in ("cam", "cells/left/realsense"):
+        folder = tmp_path / name
+        folder.mkdir(parents=True)
+        with BagWriter(folder / "one.mcap") as writer:
+            for message in open_bag(cut(folder / "before.mcap", 4)).read_messages():
+                topic = message.topic.replace("cam", name, 1) if message.topic.startswith("cam") else message.topic
+                writer.write_raw(topic, message.type, message.data, message.log_time)
+        cameras = " ".join(f"{name}{k}" for k in range(4))
+        assert open_bag(folder / "one.mcap").cameras == tuple(cameras.split())
+        assert track(folder / "one.mcap", folder / "out", "--cameras", cameras) == 0
+        tracks[name] = [m.data for m in open_bag(folder / "out" / "one.mcap").read_messages((TRACKER_POINTS,))]
+    assert len(tracks["cam"]) == 4 and tracks["cells/left/realsense"] == tracks["cam"]
+
+
 def make_set(folder: Path) -> Path:
     """Two bags of pictures with facts, as a user would write it."""
     folder.mkdir()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -80,8 +80,13 @@ class PlantArm:
         return dict(reply)
 
 
-def connect_plant(host: str = HOST, port: int = PORT, patience: float = STARTING) -> PlantArm:
-    """Connect to a plant node within `patience` [s]. Raises: InputError if nobody answers."""
+def connect_plant(
+    host: str = HOST, port: int = PORT, patience: float = STARTING, sleep: Callable[[float], None] = time.sleep
+) -> PlantArm:
+    """Connect to a plant node within `patience` [s]; `sleep` may end the waiting by an exception.
+
+    Raises: InputError if nobody answers.
+    """
     end = time.monotonic() + patience
     while True:
         try:
@@ -90,6 +95,6 @@ def connect_plant(host: str = HOST, port: int = PORT, patience: float = STARTING
         except OSError as error:
             if time.monotonic() > end:
                 raise InputError(f"plant: nobody at {host}:{port}", got=error, next_step=START_IT) from error
-            time.sleep(0.1)
+            sleep(0.1)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return PlantArm(connection)

@@ -13,7 +13,7 @@ from pred_core.bag.episode import check_forward
 from pred_core.bag.grippers import read_gripper_closed, read_gripper_pose
 from pred_core.bag.images import COLOR
 from pred_core.bag.reader import BagMessage, BagReader, open_bag
-from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, REQUIRED, TRACKER_POINTS, camera_of, stamp_of
+from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, REQUIRED, TRACKER_POINTS, camera_topics, stamp_of
 from pred_core.errors import BagError, DatasetError, nearest
 
 WINDOW = 512  # messages held back to bring topics into the order of their stamps
@@ -76,7 +76,7 @@ def _clip(path: Path, entry: EpisodeEntry, kind: str, points: bool) -> Clip:
     reader = open_bag(path)
     if reader.damage is not None:
         raise BagError(f"{path.name}: truncated or damaged bag, {reader.damage}", next_step="Record the episode again")
-    cameras = tuple(t for t in reader.topics if camera_of(t) is not None)
+    cameras = tuple(camera_topics(reader.topics))
     pictures = [t for t in cameras if f"/{COLOR}" in t]
     points = points and (TRACKER_POINTS in reader.topics or not pictures)
     needed = REQUIRED if points else tuple(t for t in REQUIRED if t != TRACKER_POINTS)

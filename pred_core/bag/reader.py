@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from pred_core.bag import mcap_records as mcap
-from pred_core.bag.wire import REQUIRED, TYPES, bare_topic, camera_of, decode
+from pred_core.bag.wire import REQUIRED, TYPES, bare_topic, camera_topics, decode
 from pred_core.errors import BagError, nearest
 
 
@@ -63,7 +63,7 @@ class BagReader:
     @property
     def cameras(self) -> tuple[str, ...]:
         """Prefixes of the cameras in the bag."""
-        return tuple(sorted({c for t in self.topics if (c := camera_of(t)) is not None}))
+        return tuple(sorted({camera for camera, _ in camera_topics(self.topics).values()}))
 
     def require(self, topics: Iterable[str] = REQUIRED) -> None:
         """Raise BagError unless every topic is there, with its type and at least one message."""

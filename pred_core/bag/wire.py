@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import re
+from collections.abc import Iterable
 from typing import Any
 
 from rosbags.serde.errors import SerdeError
@@ -45,7 +46,7 @@ TYPES: dict[str, str] = {
 }
 REQUIRED: tuple[str, ...] = (TRACKER_POINTS, GRIPPER_POSE, GRIPPER_CLOSED)
 
-_CAMERA = re.compile(r"^(cam[^/]*)/(color|depth|pose)(/|$)")
+_PICTURE = re.compile(r"(.+?)/((?:color|depth)/.+)")
 
 # What a damaged message makes the decoder raise; each becomes a BagError.
 _DECODER_ERRORS = (SerdeError, ValueError, IndexError, KeyError, TypeError, AssertionError, OverflowError, MemoryError)
@@ -56,10 +57,16 @@ def bare_topic(topic: str) -> str:
     return topic.lstrip("/")
 
 
-def camera_of(topic: str) -> str | None:
-    """The camera prefix (`cam0`) of a camera topic, else None."""
-    match = _CAMERA.match(bare_topic(topic))
-    return match.group(1) if match else None
+def camera_topics(topics: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """The topics of cameras: topic -> (prefix, what is below it), as `cam0/color/image_raw` -> (`cam0`, ...).
+
+    A camera is whatever has topics below `color/` or `depth/`; its pose belongs to it.
+    """
+    bare = {topic: bare_topic(topic) for topic in topics}
+    matches = {topic: match for topic, name in bare.items() if (match := _PICTURE.fullmatch(name))}
+    poses = {f"{match.group(1)}/pose": match.group(1) for match in matches.values()}
+    found = {topic: (match.group(1), match.group(2)) for topic, match in matches.items()}
+    return found | {topic: (poses[name], "pose") for topic, name in bare.items() if name in poses}
 
 
 @functools.cache

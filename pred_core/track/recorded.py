@@ -6,7 +6,7 @@ import functools
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,16 @@ from pred_core.bag.episode import read_episode
 from pred_core.bag.grippers import read_gripper_closed, read_gripper_pose
 from pred_core.bag.playlist import Clip, Timed, find_clips, stream
 from pred_core.bag.reader import open_bag
-from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS, TYPES, camera_of, decode, stamp_of
+from pred_core.bag.wire import (
+    GRIPPER_CLOSED,
+    GRIPPER_POSE,
+    TRACKER_POINTS,
+    TYPES,
+    bare_topic,
+    camera_topics,
+    decode,
+    stamp_of,
+)
 from pred_core.bag.writer import BagWriter
 from pred_core.config import to_mapping
 from pred_core.errors import BagError, DatasetError, PredError, nearest
@@ -48,7 +57,7 @@ class BagCount:
 
 def camera_names(clip: Clip) -> list[str]:
     """Prefixes of the cameras in a bag."""
-    return sorted({c for t in clip.cameras if (c := camera_of(t)) is not None})
+    return sorted({camera for camera, _ in camera_topics(clip.cameras).values()})
 
 
 def track_bags(
@@ -117,9 +126,10 @@ class _Tracking:
 
     def __init__(self, clip: Clip, settings: TrackerSettings, progress: Callable[[int], None]):
         self._clip, self._progress = clip, progress
-        self._tracker = make_tracker(settings)
-        self._names = parse_cameras(settings.cameras)
+        self._names = [bare_topic(name) for name in parse_cameras(settings.cameras)]
+        self._tracker = make_tracker(replace(settings, cameras=" ".join(self._names)))
         self._patience = round(settings.patience * 1e9)  # [ns]
+        self._topics = camera_topics(clip.cameras)
         self._types = {topic: info.type for topic, info in open_bag(clip.path).topics.items()}
         for missing in set(self._names) - set(camera_names(clip)):
             next_step = nearest(missing, camera_names(clip))
@@ -179,7 +189,7 @@ class _Tracking:
             self._gripped = True
 
     def _camera(self, timed: Timed) -> None:
-        name, _, below = timed.topic.partition("/")
+        name, below = self._topics[timed.topic]
         raw = images.raw_topic(timed.topic)
         if name not in self._cameras or (raw != timed.topic and raw in self._types):  # a bag may have both
             return
