@@ -1,4 +1,4 @@
-"""Entry points of nodes and commands: Ctrl-C while their modules still load, which takes seconds, leaves no traceback."""
+"""Entry points of nodes and commands: Ctrl-C while their modules load, which takes seconds, leaves no traceback."""
 
 from __future__ import annotations
 

@@ -50,8 +50,8 @@ def test_every_node_module_has_an_entry_point_that_exists(arguments: dict[str, A
 
 def test_ctrl_c_while_the_modules_load_ends_quietly() -> None:
     code = (
-        "import importlib, signal; from pred_ros import entry; signal.signal(signal.SIGINT, signal.default_int_handler);"
-        "importlib.import_module = lambda module: signal.raise_signal(signal.SIGINT); entry.predictor()"
+        "import importlib, signal; from pred_ros import entry; signal.signal(signal.SIGINT, signal.default_int_handler)"
+        "; importlib.import_module = lambda module: signal.raise_signal(signal.SIGINT); entry.predictor()"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
