@@ -35,7 +35,7 @@ from reroute_trial import TrialConfig, run_trial, write_whole
 from pred_core.bag.deform import claim_folder
 from pred_core.cli.main import BAD_INPUT
 from pred_core.config import from_mapping, to_mapping
-from pred_core.errors import ConfigError, PredError
+from pred_core.errors import PredError
 from pred_core.plan.task import load_settings
 from pred_core.twin import Twin
 
@@ -117,9 +117,6 @@ def run_trials(args: argparse.Namespace) -> int:
     """Trials that are missing, seed by seed. Returns 1 if one failed."""
     values = {f.name: getattr(args, f.name) for f in dataclasses.fields(TrialConfig)}
     config = from_mapping(TrialConfig, values, "reroute run")
-    if args.trials < 1 or args.first < 0 or args.jobs < 1:
-        raise ConfigError("--trials, --first, --jobs", got=f"{args.trials} {args.first} {args.jobs}",
-                          allowed="1 or more, 0 or more, 1 or more")  # fmt: skip
     left = []
     for seed in range(args.first, args.first + args.trials):
         for name in args.twin or TWINS:

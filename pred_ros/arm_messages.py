@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from geometry_msgs.msg import PoseArray
 from numpy.typing import NDArray
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from pred_core.arm.follower import Plan, make_plan
+from pred_core.arm.follower import MOST_POINTS, Plan, make_plan
 from pred_core.arm.limits import GuardConfig
 from pred_core.arm.protocol import Reading
 from pred_core.bag.grippers import PoseFrame
@@ -18,6 +19,22 @@ from pred_ros import convert
 
 COMMAND = "gripper/command"
 PLAN = "plan/trajectory"
+POINT_BYTES = 80  # on the wire, where a point has one transform and nothing else
+
+
+def bytes_to_plan(data: bytes, config: GuardConfig) -> Plan:
+    """The plan of the one gripper of this arm, of a message as it came: a large one takes too long to unpack.
+
+    Raises: InputError for one that cannot be followed.
+    """
+    if len(data) > 2 * MOST_POINTS * POINT_BYTES:
+        raise InputError(
+            f"{PLAN}: too long to be read while the arm moves",
+            got=f"{len(data):,} bytes, some {len(data) // POINT_BYTES:,} points",
+            allowed=f"{MOST_POINTS:,} points",
+            next_step="Send it in parts, or with points farther apart",
+        )
+    return message_to_plan(deserialize_message(data, MultiDOFJointTrajectory), config)
 
 
 def message_to_plan(message: MultiDOFJointTrajectory, config: GuardConfig) -> Plan:

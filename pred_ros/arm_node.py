@@ -27,7 +27,7 @@ from pred_core.arm.disconnected import DisconnectedArm
 from pred_core.arm.dry_run import DryRunArm
 from pred_core.arm.follower import Follower
 from pred_core.arm.guard import Guard, Mode
-from pred_core.arm.limits import GuardConfig, bounds_of
+from pred_core.arm.limits import MOST_LIFETIME, GuardConfig, bounds_of
 from pred_core.arm.placement import Placement
 from pred_core.arm.plan_needs import LIFETIME
 from pred_core.arm.plant import HOST, PATIENCE, PORT, STARTING, connect_plant
@@ -40,9 +40,11 @@ from pred_core.config import setting
 from pred_core.errors import ConfigError, InputError, PredError
 from pred_ros import arm_messages, convert, qos, shell
 from pred_ros.diagnostics import ERROR, OK, WARN
-from pred_ros.shell import Shell
+from pred_ros.shell import REFUSAL_SHOWN, REFUSED, Shell
 
 LEVELS = {Mode.FAULT: ERROR, Mode.RAMPING: WARN}
+AGAIN = "; when its cause is gone, call ~/reset, then ~/enable"  # what a fault asks for
+ENDED = "the plan ended in motion (its last two poses differ) and no other came"  # why no set-points are asked for
 ACTIVE = (Mode.HOLDING, Mode.MOVING, Mode.RAMPING)
 OTHER_CLOCK = 1_000_000_000  # [ns] from the node's time: an arm's stamp farther off is not on the node's clock
 
@@ -55,7 +57,7 @@ class ArmConfig(GuardConfig):
     host: str = setting("", doc="address of the arm's controller; of a plant, this machine unless told otherwise")
     port: int = setting(PORT, low=1, high=65535, doc="of a plant's controller")
     source: str = setting("plan", choices=("plan", "command"), doc="follow plan/trajectory or gripper/command")
-    lifetime: float = setting(LIFETIME, unit="s", low=0.1, high=600.0, doc="age at which a plan is followed no more")
+    lifetime: float = setting(LIFETIME, unit="s", low=0.1, high=MOST_LIFETIME, doc="age up to which a plan is followed")
     base_x: float = setting(0.0, unit="m", low=-5.0, high=5.0, doc="the arm's base in world")
     base_y: float = setting(0.0, unit="m", low=-5.0, high=5.0, doc="the arm's base in world")
     base_z: float = setting(0.0, unit="m", low=-5.0, high=5.0, doc="the arm's base in world")
@@ -101,12 +103,13 @@ class ArmNode(Shell):
         self._closed: bool | None = None  # as published last
         self._measured = -1  # [ns] of the pose that was published last
         self._said: tuple[Mode, str] | None = None
+        self._mentioned = False  # the headline is a refusal that is not about the mode
         self._broken = False  # the arm could not be read
 
     def setup(self) -> None:
         """Check the limits, connect, make the publishers and services."""
         config: ArmConfig = self.config
-        self._guard = Guard(config)
+        self._guard = self._make_guard()
         self._follower = Follower(config, config.lifetime)
         if self._arm is None:
             self.report(OK, f"connecting to {config.arm}")
@@ -125,11 +128,11 @@ class ArmNode(Shell):
     def start(self) -> None:
         """Listen and tick; not armed yet."""
         if self._arm is None:  # active again after a pause
-            self._guard, self._follower = Guard(self.config), Follower(self.config, self.config.lifetime)
+            self._guard, self._follower = self._make_guard(), Follower(self.config, self.config.lifetime)
             self._arm = make_arm(self.config, sleep=self.sleep)
         if self.config.source == "plan":
             self._heard: Any = self.create_subscription(
-                MultiDOFJointTrajectory, arm_messages.PLAN, self._on_plan, qos.plans()
+                MultiDOFJointTrajectory, arm_messages.PLAN, self._on_plan, qos.plans(), raw=True
             )
         else:
             self._heard = self.create_subscription(PoseArray, arm_messages.COMMAND, self._on_command, qos.command())
@@ -165,14 +168,17 @@ class ArmNode(Shell):
             for what, count in self._guard.counts.items():
                 self.diagnostics.value(f"count: {what}", str(count))
 
+    def _make_guard(self) -> Guard:
+        return Guard(self.config, ENDED if self.config.source == "plan" else "no command")
+
     def _now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
 
-    def _on_plan(self, message: MultiDOFJointTrajectory) -> None:
+    def _on_plan(self, data: bytes) -> None:
         self.diagnostics.seen(arm_messages.PLAN)
         setpoint = self._guard.setpoint
         try:
-            plan = arm_messages.message_to_plan(message, self.config)
+            plan = arm_messages.bytes_to_plan(data, self.config)
             if setpoint is None or self._guard.mode not in ACTIVE:
                 raise InputError(
                     f"a plan while {self._guard.line}", next_step="Call enable, then plan from where it is"
@@ -199,7 +205,13 @@ class ArmNode(Shell):
         self.diagnostics.count(f"{what} refused")
         self.diagnostics.value("last refusal", line)
         if self._guard.mode is not Mode.FAULT:
-            self.report(WARN, f"refused: {line}")
+            self._mention(f"refused: {line}")
+
+    def _mention(self, line: str) -> None:
+        """The headline for a while; a fault stays one."""
+        self.diagnostics.seen(REFUSED)
+        self._mentioned = True
+        self.report(ERROR if self._guard.mode is Mode.FAULT else WARN, line)
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if not request.data:
@@ -211,7 +223,7 @@ class ArmNode(Shell):
             self._enable()
         except InputError as error:
             response.success, response.message = False, str(error)
-            self.report(WARN, str(error))
+            self._mention(str(error))
         else:
             response.success, response.message = True, self._guard.line
         return response
@@ -269,9 +281,12 @@ class ArmNode(Shell):
             self._ask(now)
             self._guard.measured(reading.position, reading.rotation)
         self._drive(now)
+        if self._mentioned and (self.diagnostics.age(REFUSED) or 0.0) > REFUSAL_SHOWN:
+            self._mentioned, self._said = False, None
         if (self._guard.mode, self._guard.line) != self._said:
             self._said = (self._guard.mode, self._guard.line)
-            self.report(WARN if self._guard.clipped else LEVELS.get(self._guard.mode, OK), self._guard.line)
+            again = AGAIN if self._guard.mode is Mode.FAULT else ""
+            self.report(WARN if self._guard.clipped else LEVELS.get(self._guard.mode, OK), self._guard.line + again)
 
     def _read(self, now: int) -> Reading | None:
         """Read and publish; None, and the arm is stopped, if it cannot be read or would not follow."""

@@ -1,10 +1,13 @@
-"""Entry points of nodes and commands: Ctrl-C while their modules load, which takes seconds, leaves no traceback."""
+"""Entry points of nodes and commands: Ctrl-C while their modules load, which takes seconds, leaves no traceback.
+
+The process ends within the signal's handler: an exception would come out of an extension module as another one.
+"""
 
 from __future__ import annotations
 
 import importlib
 import os
-import sys
+import signal
 from collections.abc import Callable
 
 NODE_ENDED, COMMAND_ENDED = 0, 130  # exit codes of what a person has interrupted
@@ -12,11 +15,9 @@ NODE_ENDED, COMMAND_ENDED = 0, 130  # exit codes of what a person has interrupte
 
 def _entry(module: str, code: int) -> Callable[[], int]:
     def main() -> int:
-        try:
-            loaded = importlib.import_module(module)
-        except KeyboardInterrupt:
-            sys.stderr.flush()
-            os._exit(code)  # the interpreter's own teardown would wait for what torch has begun to load
+        before = signal.signal(signal.SIGINT, lambda *_: os._exit(code))
+        loaded = importlib.import_module(module)
+        signal.signal(signal.SIGINT, before)
         return int(loaded.main())
 
     return main

@@ -24,7 +24,8 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
 from pred_core.arm.approach import TimedPoses, with_approach
-from pred_core.arm.follower import WORLD
+from pred_core.arm.follower import MOST_POINTS
+from pred_core.arm.limits import MOST_LIFETIME
 from pred_core.arm.plan_file import read_motion
 from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_POSE
@@ -36,9 +37,11 @@ from pred_ros.diagnostics import ERROR, OK, WARN
 
 PATIENCE = 25.0  # [s] for the arm node to be there; after one of us was killed it can take 20 s until it is found
 AHEAD = 0.3  # [s] between sending and the beginning
-ANSWER = 1.0  # [s] in which a refusal comes
+ANSWER = 1.0  # [s] for the arm's stop, and after the end for what it has to say of it
+SILENT = 5.0  # [s] in which the arm, which says how many plans it took once a second, must have taken this one
 ARRIVED = 0.02  # [m] from the last pose
 REFUSED = " refused"  # how the arm's counters of what it refused end
+ACCEPTED = "count: plans"  # the arm's counter of plans that it follows
 SHOWN = 1.0  # [s] between two lines of progress
 
 
@@ -56,9 +59,7 @@ def go(args: argparse.Namespace) -> int:
     """Read, send, follow to the end. Raises: PredError."""
     if not 0.001 <= args.approach <= 0.5:
         raise ConfigError("--approach", got=args.approach, allowed="0.001 to 0.5 m/s")
-    frame, motion, rest = read_motion(args.file, args.gripper)
-    if frame != WORLD:
-        raise InputError(f"{args.file}: another frame", got=repr(frame), allowed=repr(WORLD))
+    _, motion, rest = read_motion(args.file, args.gripper)
     with Interrupts() as interrupts, transport.added(transport.variables(pictures=False)):
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         with dead_ports.avoided():
@@ -85,7 +86,7 @@ class Sender:
         self._executor.add_node(self._node)
         self._pose: PoseFrame | None = None
         self._said: tuple[bytes, str] | None = None
-        self._refusals = 0  # of plans and commands, as the arm counts them
+        self._refusals = self._accepted = 0  # of plans and commands, and of plans, as the arm counts them
         self._node.create_subscription(PoseArray, GRIPPER_POSE, self._on_pose, qos.poses_live())
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self._stop = self._node.create_client(Trigger, "/arm/stop")
@@ -114,6 +115,13 @@ class Sender:
         w, x, y, z = (float(v) for v in pose.rotation[0])
         whole = with_approach(motion, pose.position[0], (w, x, y, z), speed, rest)
         seconds = float(whole.times[-1])
+        if seconds > MOST_LIFETIME or len(whole.times) > MOST_POINTS:
+            raise InputError(
+                "the motion, with the way to its beginning, is too long for one plan",
+                got=f"{seconds:.0f} s, {len(whole.times):,} points",
+                allowed=f"{MOST_LIFETIME:g} s, {MOST_POINTS:,} points",
+                next_step="Bring the arm near to its beginning, or split it",
+            )
         print(f"{seconds:.1f} s, {seconds - float(motion.times[-1] - motion.times[0]):.1f} s of it to the beginning")
         begin = self._now() + round(AHEAD * 1e9)
         self._said = None
@@ -134,12 +142,16 @@ class Sender:
 
     def _follow(self, begin: int, seconds: float) -> None:
         """Until the end. Raises: RefusedError; InputError for an error. A warning, which may be of before, is shown."""
-        end, shown, warned, refusals = begin + round((seconds + ANSWER) * 1e9), 0.0, "", self._refusals
+        end, shown, warned = begin + round((seconds + ANSWER) * 1e9), 0.0, ""
+        refusals, accepted, taken = self._refusals, self._accepted, False
         while self._now() < end:
             self._spin()
             level, line = self._said or (OK, "")
-            if self._refusals > refusals and self._now() < begin + round(ANSWER * 1e9):  # later ones are of others
+            taken = taken or self._accepted > accepted
+            if not taken and self._refusals > refusals:  # those that come later are of others
                 raise RefusedError(f"arm: {line}")
+            if not taken and self._now() > begin + round(SILENT * 1e9):
+                raise InputError("the arm has not said that it takes the motion", got=line or "nothing")
             if level == ERROR:
                 raise InputError(f"arm: {line}")
             if level == WARN and line != warned:
@@ -179,8 +191,10 @@ class Sender:
         for status in message.status:
             if status.name.rsplit("/", 1)[-1] == "arm":
                 self._said = (status.level, status.message)
-                counts = [int(v.value) for v in status.values if v.key.endswith(REFUSED) and v.value.isdigit()]
-                self._refusals = max(self._refusals, sum(counts))
+                counts = {v.key: int(v.value) for v in status.values if v.value.isdigit()}
+                refused = sum(number for what, number in counts.items() if what.endswith(REFUSED))
+                self._refusals = max(self._refusals, refused)
+                self._accepted = max(self._accepted, counts.get(ACCEPTED, 0))
 
 
 def _message(stamp: int, poses: TimedPoses) -> MultiDOFJointTrajectory:

@@ -285,7 +285,8 @@ class PlannerNode(Shell):
         self.diagnostics.value("motions tried", str(plan.motions))
         self.diagnostics.value("frames simulated a second", f"{rate:.0f}")
         self.diagnostics.value("cost, standing still", f"{plan.cost:.4g}, {plan.still:.4g}")
-        self.report(OK, "planning")
+        if not self.refusal:
+            self.report(OK, "planning")
 
     def _send(self, plan: Plan | None) -> None:
         if plan is None:

@@ -41,7 +41,7 @@ class Job:
     nodes: Mapping[str, Mapping[str, object]]  # node -> parameters
     goal: Array  # (Q, 3) [m] world
     out: Path
-    limit: float = 90.0  # [s] of the cell's time after the arm was enabled
+    limit: float  # [s] of the cell's time after the arm was enabled
     fault: Fault | None = None
     fault_at: float = 3.0  # [s] after the arm was enabled
     camera: str | None = "cam0"  # whose pictures are kept
@@ -133,7 +133,9 @@ def run(job: Job, show: Show) -> Record:
     gap = float(str(job.nodes["plant"].get("gap", SlotConfig.gap)))
     record = Record(SlotConfig(gap=gap), job.goal)
     ended: BaseException | None = None
-    shared = {name: environment[name] for name in SHARED} | transport.variables(False, environment)
+    # Pictures need shared memory, which is not safe from a killed process that has a part in it.
+    pictures = job.camera is not None and (job.fault is None or job.fault.name != "tracker_killed")
+    shared = {name: environment[name] for name in SHARED} | transport.variables(pictures, environment)
     with transport.added(shared), BagWriter(job.out / BAG) as writer, Interrupts() as interrupts:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         watch = Watch(record, writer, job.camera, interrupts)

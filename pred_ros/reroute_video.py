@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -29,7 +29,8 @@ NEAR = 0.05  # [m] in front of the camera; nearer points are not drawn
 
 
 def write_video(record: Record, path: Path) -> int:
-    """Write the pictures from the begin on at the rate they were taken; returns how many (0: no file).
+    """Write the pictures from the begin on, in their own time; returns how many there were (0: no file). Where some are
+    missing, the one before stays.
 
     Raises: ConfigError if OpenCV is missing or cannot write this format.
     """
@@ -37,19 +38,33 @@ def write_video(record: Record, path: Path) -> int:
     if not frames or record.view is None:
         return 0
     cv2 = _opencv()
-    gaps = np.diff([s for s, _ in frames])
-    rate = NS / float(np.median(gaps)) if len(gaps) else 10.0
+    rate = NS / spacing_of([s for s, _ in frames])
     with _quiet():
         writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"VP80"), rate, SIZE)
     if not writer.isOpened():
         raise ConfigError("this OpenCV cannot write VP8 video", next_step="pip install 'opencv-python-headless<5'")
     height, width = _decoded(frames[0][1]).shape[:2]
     view, part = closer(record, record.view, width, height)
-    for stamp, jpeg in frames:
-        picture = cv2.warpAffine(_decoded(jpeg), part, SIZE)
-        writer.write(draw(record, view, stamp, picture))
+    shown = 0
+    for k, (stamp, jpeg) in enumerate(frames):
+        picture = draw(record, view, stamp, cv2.warpAffine(_decoded(jpeg), part, SIZE))
+        until = frames[k + 1][0] if k + 1 < len(frames) else stamp + NS / rate
+        while shown < round((until - frames[0][0]) * rate / NS):
+            writer.write(picture)
+            shown += 1
     writer.release()
     return len(frames)
+
+
+def spacing_of(stamps: Sequence[int]) -> float:
+    """[ns] between two pictures of the camera, also where most of them are missing; 0.1 s where there is only one."""
+    return float(np.quantile(np.diff(stamps), 0.1)) if len(stamps) > 1 else 0.1 * NS
+
+
+def missing_pictures(record: Record) -> int:
+    """How many pictures between the first and the last one did not come."""
+    stamps = [s for s, _ in record.pictures]
+    return max(0, round((stamps[-1] - stamps[0]) / spacing_of(stamps)) + 1 - len(stamps)) if stamps else 0
 
 
 def closer(record: Record, view: View, width: int, height: int) -> tuple[View, Array]:

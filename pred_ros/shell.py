@@ -6,7 +6,9 @@ make is destroyed by the shell at cleanup and shutdown.
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import signal
 import sys
 import time
@@ -39,6 +41,8 @@ BAD_INPUT = 2
 POLL = 0.05  # [s] how soon a signal or the end of the work is noticed
 REFUSAL_SHOWN = 2.0  # [s] how long a refused message stays the headline of the diagnostics
 REFUSED = "refused message"
+AGAIN = 5.0  # [s] after which a line that differs from an earlier one in its numbers only is said at once again
+NUMBERS = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 HOW = "Give parameters as: {} --ros-args -p NAME:=VALUE, or --params-file FILE"
 
 
@@ -79,6 +83,8 @@ class Shell(LifecycleNode):
         self.bug: BaseException | None = None
         self.asked: list[int] = []  # the signals that asked the process to end
         self._refusal = ""
+        self._told: dict[str, float] = {}  # a line without its numbers -> [s] when it was said at once
+        self._shown: bytes = OK  # the level published last
         self.diagnostics = Diagnostics(self.get_fully_qualified_name(), self.seconds)
         self._diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._timer = self.create_timer(1.0, self._heartbeat)
@@ -110,9 +116,17 @@ class Shell(LifecycleNode):
         """A new configuration is about to hold. Raise PredError to refuse it."""
 
     def report(self, level: bytes, message: str) -> None:
-        """Set the diagnostic status; a change is logged and published at once."""
-        if self.diagnostics.status(level, message):
+        """Set the diagnostic status; a change is logged and published at once, but of lines that differ in their
+        numbers only one in `AGAIN`: the others come with the next heartbeat.
+        """
+        if not self.diagnostics.status(level, message):
+            return
+        line, now = NUMBERS.sub("#", message), time.monotonic()
+        news = now - self._told.get(line, -math.inf) >= AGAIN
+        if news:
+            self._told = {k: t for k, t in self._told.items() if now - t < AGAIN} | {line: now}
             self._log(level, message)
+        if news or level != self._shown:
             self.publish_diagnostics()
 
     def _log(self, level: bytes, message: str) -> None:
@@ -126,6 +140,7 @@ class Shell(LifecycleNode):
 
     def publish_diagnostics(self) -> None:
         """Publish the diagnostic status now."""
+        self._shown = self.diagnostics.level
         self._diagnostics_out.publish(self.diagnostics.message_at(self.get_clock().now().to_msg()))
 
     def seconds(self) -> float:

@@ -28,7 +28,7 @@ from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, STATE_POINTS, TRACKER_POINTS
 from pred_core.config import setting
-from pred_core.errors import ConfigError, PredError
+from pred_core.errors import ConfigError, InputError, PredError
 from pred_core.track.estimate import Estimate, Prior
 from pred_core.track.settings import TrackerSettings, make_tracker, parse_cameras, parse_fixtures
 from pred_core.track.tracker import Tracker
@@ -194,7 +194,10 @@ class TrackerNode(Shell):
             self._on_closed(message)
 
     def _set_closed(self, message: UInt8MultiArray) -> None:
-        self._closed = convert.message_to_closed(message)
+        closed = convert.message_to_closed(message)
+        if not len(closed):
+            raise InputError(f"{GRIPPER_CLOSED} is empty", allowed="one flag a gripper", next_step="Check who sends it")
+        self._closed = closed
 
     def _on_pose(self, message: PoseArray) -> None:
         self.take(GRIPPER_POSE, self._add_pose, message)

@@ -137,9 +137,9 @@ def test_a_short_hole_in_the_poses_is_bridged_as_configured_and_a_longer_one_is_
     assert len(states) >= 30 * TICK // period - 1 and BEGIN + 90 * TICK - states[-1].stamp < period + TICK
     assert (bridged.counts.runs, bridged.counts.gaps) == (1, 0)
     assert np.abs(states[-1].state.position.numpy() - hanging()).max() < 0.008
-    assert follow(plain, range(90, 91), every=0) == [] and plain.counts.gaps == 1
-    assert follow(longer, range(120, 121), every=0) == [] and longer.counts.gaps == 1, "0.8 s"
-    assert follow(longer, range(121, 160)) and longer.counts.runs == 2
+    assert follow(plain, range(90, 92), every=0) == [] and plain.counts.gaps == 1
+    assert follow(longer, range(120, 122), every=0) == [] and longer.counts.gaps == 1, "0.8 s"
+    assert follow(longer, range(122, 160)) and longer.counts.runs == 2
 
 
 def test_frames_older_than_the_history_are_counted() -> None:

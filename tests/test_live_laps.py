@@ -9,13 +9,17 @@ from live_world import CLOSED, COUNT, START, STEP, Straight, points, pose
 
 from pred_core.bag.clouds import PointFrame
 from pred_core.bag.grippers import PoseFrame
+from pred_core.calibration import Calibration
 from pred_core.errors import InputError, TwinError
 from pred_core.live import run
+from pred_core.live.following import Follower
 from pred_core.live.laps import AHEAD, Laps
 from pred_core.live.marks import EpisodeMark
 from pred_core.live.prediction import Predictor
 from pred_core.live.prediction_records import Rules
 from pred_core.live.scoring import Scorer
+from pred_core.springmass.topology import build_body
+from pred_core.types import Physics
 
 SECOND = 1_000_000_000
 IDS = np.arange(COUNT, dtype=np.uint32)
@@ -26,13 +30,21 @@ def predictor(**rules: float) -> Predictor:
     return Predictor(Straight(), IDS, {0: 0}, Rules(**rules))
 
 
+def follower(delay: float) -> Follower:
+    """The same, corrected by its tracks, which are `delay` [s] old when their stamps say now."""
+    rest = points(0).position
+    physics = Physics(stiffness=100.0, damping=0.05, connection_threshold=0.06, max_springs=4)
+    body = build_body("line", rest, 0.05, physics, id=IDS)
+    return Follower(Straight(), body, {0: 0}, Rules(), Calibration(delay=delay))
+
+
 def moved(frame: int, ahead: float) -> PointFrame:
     """Frame k stamped `ahead` [s] too late."""
     seen = points(frame)
     return PointFrame(seen.stamp + round(ahead * SECOND), seen.position, seen.id, seen.confidence, None)
 
 
-def feed(machine: Predictor, frames: range) -> list[int]:
+def feed(machine: Predictor | Follower, frames: range) -> list[int]:
     """Pose and points of every frame; returns the frames that were predicted."""
     found = []
     for frame in frames:
@@ -91,17 +103,6 @@ def test_one_cloud_from_the_future_costs_no_prediction(ahead: float) -> None:
     assert feed(machine, range(60, 70)) == list(range(62, 70)), "a new run starts"
 
 
-@pytest.mark.parametrize("ahead", [0.5, 5.0], ids=lambda s: f"{s} s")
-def test_one_pose_from_the_future_ends_the_run_and_the_next_frames_start_one(ahead: float) -> None:
-    machine = predictor()
-    feed(machine, range(5))
-    wrong = pose(4)
-    machine.add_pose(PoseFrame(wrong.stamp + round(ahead * SECOND), wrong.position, wrong.rotation), CLOSED)
-    assert list(machine.advance()) == []
-    found = feed(machine, range(5, 30))
-    assert found[-20:] == list(range(10, 30)), "it predicts again within five frames"
-
-
 def test_a_topic_that_falls_back_alone_and_returns_has_begun_no_lap() -> None:
     laps: Laps[None] = Laps(0.1)
     for topic in "ab":
@@ -123,14 +124,27 @@ def test_one_cloud_from_the_past_costs_no_prediction(behind: float) -> None:
     assert machine.counts.dropped_frames == 1
 
 
-@pytest.mark.parametrize("behind", [0.5, 5.0, 20.0], ids=lambda s: f"{s} s")
-def test_one_pose_from_the_past_ends_the_run_and_the_next_frames_start_one(behind: float) -> None:
+@pytest.mark.parametrize("off", [-20.0, -5.0, -0.5, 0.5, 5.0, 20.0], ids=lambda s: f"{s} s")
+@pytest.mark.parametrize("mode", ["Predictor", "Follower", "with a delay"])
+def test_one_pose_out_of_line_is_named_and_costs_no_prediction(off: float, mode: str) -> None:
+    machine = predictor() if mode == "Predictor" else follower(0.05 if mode == "with a delay" else 0.0)
+    first = feed(machine, range(20))
+    wrong = pose(19)
+    machine.add_pose(PoseFrame(wrong.stamp + round(off * SECOND), wrong.position, wrong.rotation), CLOSED)
+    assert list(machine.advance()) == []
+    with pytest.raises(InputError, match="gripper/pose: one stamp is out of line; got [+-]"):
+        machine.add_pose(pose(20), CLOSED)
+    machine.add_points(points(20))
+    found = [round((p.stamp - START) / STEP) for p in machine.advance()] + feed(machine, range(21, 40))
+    assert sorted(set(first + found)) == list(range(first[0], 40)) and machine.counts.runs == 1
+
+
+def test_a_hole_in_the_poses_or_a_loop_loses_none() -> None:
+    """The first pose behind either waits for the second."""
     machine = predictor()
     feed(machine, range(5))
-    wrong = pose(4)
-    machine.add_pose(PoseFrame(wrong.stamp - round(behind * SECOND), wrong.position, wrong.rotation), CLOSED)
-    assert list(machine.advance()) == []
-    assert feed(machine, range(5, 30))[-20:] == list(range(10, 30)), "it predicts again within five frames"
+    assert feed(machine, range(50, 60)) == list(range(52, 60)) and machine.counts.gaps == 1
+    assert feed(machine, range(10)) == list(range(2, 10)) and machine.counts.jumps == 1
 
 
 def test_a_first_cloud_from_the_future_does_not_stop_the_start() -> None:

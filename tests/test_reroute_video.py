@@ -49,6 +49,19 @@ def test_a_video_is_written_also_where_nothing_lies_before_the_camera(goal: np.n
     assert found and picture.shape == (600, 800, 3)
 
 
+def test_where_pictures_are_missing_the_one_before_stays_for_their_time(tmp_path: Path) -> None:
+    record = record_of(np.array([[0.0, 0.0, 1.0]]))
+    jpeg = record.pictures[0][1]
+    record.pictures = [(k * S // 10, jpeg) for k in (0, 1, 2, 3, 10, 20, 21)]
+    assert reroute_video.write_video(record, tmp_path / "video.webm") == 7
+    film = cv2.VideoCapture(str(tmp_path / "video.webm"))
+    frames = 0
+    while film.read()[0]:
+        frames += 1
+    assert film.get(cv2.CAP_PROP_FPS) == pytest.approx(10.0) and frames == 22, "2.2 s from the first to after the last"
+    assert reroute_video.missing_pictures(record) == 15
+
+
 def test_the_part_is_found_once_for_all_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, original = [], reroute_video.closer
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pred_core.arm.limits import GuardConfig, workspace_of
-from pred_core.arm.orientation import Quaternion, angle_between, slerp
+from pred_core.arm.limits import MOST_LIFETIME, GuardConfig, workspace_of
+from pred_core.arm.orientation import Quaternion, angle_between, conjugate, multiply, slerp
 from pred_core.errors import InputError
 
 Array = NDArray[np.float64]
@@ -21,6 +22,8 @@ OVER = 1.5  # a plan may ask for this times the speed limit between two points; 
 REST = 1e-6  # [m], [rad] between the last two points of a plan that ends at rest
 OUTSIDE = 0.005  # [m] a plan may leave the workspace by, as a measured beginning may; the guard keeps the arm inside
 MOST_WAITING = 100  # plans not yet begun
+MOST_POINTS = 5_000  # of a plan: more would keep the arm waiting while it is read
+FARTHEST = 10.0  # [m] from the origin of `world`, in a robot's reach
 
 
 @dataclass(frozen=True)
@@ -63,28 +66,58 @@ def make_plan(
     """A plan that can be followed.
 
     Args: start [ns]; frame of the poses; times (K,) [s]; position (K, 3) [m]; rotation (K, 4) wxyz.
-    Raises: InputError for another frame than world, fewer than two points, times that do not increase, values that
-    are not finite, quaternions without unit norm, or a jump between two points.
+    Raises: InputError as `checked_poses`, or for a jump between two points, or one outside the workspace.
+    """
+    moments, position, rotation = checked_poses(frame, times, position, rotation)
+    plan = Plan(start, moments, position, rotation)
+    _check_jumps(plan, config)
+    _check_place(plan, config)
+    return plan
+
+
+def checked_poses(
+    frame: str, times: Sequence[float], position: Array, rotation: Array
+) -> tuple[Array, Array, Array]:
+    """Timed poses that some arm could follow, quaternions normed.
+
+    Raises: InputError for another frame than world, fewer than two points or too many, times that do not increase,
+    values that are not finite, places out of any arm's reach, or quaternions without unit norm.
     """
     if frame != WORLD:
         raise InputError("plan is in another frame", got=repr(frame), allowed=repr(WORLD))
     moments = np.asarray(times, float)
     if len(moments) < 2:
         raise InputError("plan has too few points", got=len(moments), allowed="2 or more")
+    if len(moments) > MOST_POINTS:
+        raise InputError(
+            "plan has too many points", got=f"{len(moments):,}", allowed=f"{MOST_POINTS:,}",
+            next_step="Send it in parts, or with points farther apart",
+        )  # fmt: skip
     if position.shape != (len(moments), 3) or rotation.shape != (len(moments), 4):
         raise InputError("plan", got=f"shapes {position.shape} and {rotation.shape}", allowed="one pose per point")
     if not (np.isfinite(moments).all() and np.isfinite(position).all() and np.isfinite(rotation).all()):
         raise InputError("plan has a value that is not finite")
-    if moments[0] < 0.0 or not (np.diff(moments) > 0.0).all():
-        raise InputError("plan's times do not increase from 0", got=np.round(moments[:6], 4).tolist())
+    far = np.abs(position).max(axis=1)
+    if (far > FARTHEST).any():
+        k = int(far.argmax())
+        raise InputError(
+            f"plan is out of reach at point {k}", got=f"{np.round(position[k], 4).tolist()} m",
+            allowed=f"{FARTHEST:g} m from the origin", next_step="Positions are in metres",
+        )  # fmt: skip
+    falls = np.diff(np.concatenate(([-np.inf], moments))) <= 0.0
+    falls[0] = moments[0] < 0.0
+    if falls.any():
+        k = int(falls.argmax())
+        found = np.round(moments[max(k - 1, 0) : k + 1], 4).tolist()
+        raise InputError(f"plan's times do not increase from 0 at point {k}", got=found)
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(rotation, axis=-1)
     if not (np.abs(norm - 1.0) <= UNIT_TOLERANCE).all():
-        raise InputError("plan has a quaternion without unit norm", got=norm[:6].tolist(), allowed="1 +- 0.001")
-    plan = Plan(start, moments, np.asarray(position, float), rotation / norm[:, None])
-    _check_jumps(plan, config)
-    _check_place(plan, config)
-    return plan
+        k = int(np.argmax(~(np.abs(norm - 1.0) <= UNIT_TOLERANCE)))
+        raise InputError(
+            f"plan has a quaternion without unit norm at point {k}", got=float(norm[k]), allowed="1 +- 0.001"
+        )
+    return moments, np.asarray(position, float), rotation / norm[:, None]
 
 
 class Follower:
@@ -119,11 +152,12 @@ class Follower:
             raise InputError("plan lies in the past", got=f"it ended {(now - plan.end) / NS:.3f} s ago")
         length = (plan.end - plan.start) / NS
         if length > self._lifetime:  # it would be cut off on the way
+            longer = f", or start the arm with -p lifetime:={math.ceil(length)}.0" if length <= MOST_LIFETIME else ""
             raise InputError(
                 "plan is too long",
                 got=f"{length:.3f} s from its stamp to its end",
                 allowed=f"{self._lifetime:g} s",
-                next_step=f"Send it in parts, or start the arm with -p lifetime:={math.ceil(length)}.0",
+                next_step=f"Send it in parts{longer}",
             )
         if plan.begin - now > self._lifetime * NS:
             raise InputError(
@@ -190,16 +224,23 @@ def _check_place(plan: Plan, config: GuardConfig) -> None:
 
 
 def _check_jumps(plan: Plan, config: GuardConfig) -> None:
-    for k in range(len(plan.times) - 1):
-        seconds = float(plan.times[k + 1] - plan.times[k])
-        off = float(np.linalg.norm(plan.position[k + 1] - plan.position[k]))
-        angle = angle_between(_wxyz(plan.rotation[k]), _wxyz(plan.rotation[k + 1]))
-        if off > OVER * config.speed * seconds + REST or angle > OVER * config.angular_speed * seconds + REST:
-            raise InputError(
-                f"plan jumps after point {k}",
-                got=f"{1e3 * off:.1f} mm and {angle:.3f} rad in {seconds:.3f} s",
-                allowed=f"{OVER * config.speed:g} m/s and {OVER * config.angular_speed:g} rad/s",
-            )
+    seconds = np.diff(plan.times)
+    off = np.linalg.norm(np.diff(plan.position, axis=0), axis=-1)
+    w, x, y, z = multiply(_columns(plan.rotation[1:]), conjugate(_columns(plan.rotation[:-1])))
+    angle = 2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))  # `angle_between`, of all
+    jumps = (off > OVER * config.speed * seconds + REST) | (angle > OVER * config.angular_speed * seconds + REST)
+    if jumps.any():
+        k = int(jumps.argmax())
+        raise InputError(
+            f"plan jumps after point {k}",
+            got=f"{1e3 * off[k]:.1f} mm and {angle[k]:.3f} rad in {seconds[k]:.3f} s",
+            allowed=f"{OVER * config.speed:g} m/s and {OVER * config.angular_speed:g} rad/s",
+        )
+
+
+def _columns(rotation: Array) -> Any:
+    """The components (K,) of K quaternions, in place of plain numbers."""
+    return tuple(rotation.T)
 
 
 def _wxyz(row: Array) -> Quaternion:

@@ -41,8 +41,9 @@ class Mode(Enum):
 class Guard:
     """State of one arm's guard. `line` says why it is where it is; `counts` what it refused or clipped."""
 
-    def __init__(self, config: GuardConfig):
-        self.config = config
+    def __init__(self, config: GuardConfig, silence: str = "no command"):
+        """silence: what a fault says there was, for so and so long, when commands have stopped."""
+        self.config, self._silence = config, silence
         self.bounds = bounds_of(config)
         self.mode = Mode.DISARMED
         self.line = "not armed yet"
@@ -174,13 +175,17 @@ class Guard:
         """The set-point at `now` [ns]; None before the guard was armed for the first time.
 
         Call it `rate` times a second. Ticks that come in a burst do not make the arm faster: a tick sooner than half
-        a period after the one before returns the same set-point again, and lost ticks are not made up for.
+        a period after the one before returns the same set-point again, and lost ticks are not made up for: the arm has
+        stopped by itself when they are many, so while it moves that is a fault.
         """
         if self._smoother is None:
             return None
         if self._last is not None and now < self._last:
             self.stop(f"the clock went back by {(self._last - now) / NS:.3f} s")
             self._due = None
+        gap = 0.0 if self._last is None else (now - self._last) / NS
+        if gap > self.config.fault_after and self.mode in (Mode.MOVING, Mode.RAMPING):
+            self.stop(f"no set-point for {gap:.3f} s while moving: this process was held up")
         self._last = now
         period = round(self.bounds.period * NS)
         if self._due is not None and now < self._due - period // 4:
@@ -194,7 +199,7 @@ class Guard:
             return
         age = (now - self._watched) / NS
         if age > self.config.fault_after:
-            self.stop(f"no command for {self.config.fault_after:g} s")
+            self.stop(f"{self._silence} for {self.config.fault_after:g} s")
         elif age > self.config.ramp_after and self.mode is Mode.MOVING:
             self._freeze(Mode.RAMPING, Mode.RAMPING.value)
             self.counts["ramps"] += 1

@@ -14,6 +14,9 @@ from pred_core.errors import ConfigError
 Array = NDArray[np.float64]
 
 
+MOST_LIFETIME = 600.0  # [s] of a plan, whatever the arm node is told
+
+
 @dataclass(frozen=True)
 class GuardConfig:
     """Limits of the guard, in `world`. They hold for every set-point that goes to an arm."""

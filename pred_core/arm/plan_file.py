@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pred_core.arm.approach import TimedPoses
-from pred_core.arm.follower import OVER, Plan, make_plan
+from pred_core.arm.follower import OVER, Plan, checked_poses, make_plan
 from pred_core.arm.limits import GuardConfig
 from pred_core.arm.plan_needs import as_parameters, needs_of
 from pred_core.config import load_yaml
@@ -18,7 +18,10 @@ from pred_core.errors import ConfigError, InputError
 
 
 def read_motion(path: Path, gripper: int = 0) -> tuple[str, TimedPoses, float]:
-    """Frame, poses of one gripper, and how long [s] the object rests before. Raises: ConfigError for another layout."""
+    """Frame, poses of one gripper, and how long [s] the object rests before.
+
+    Raises: ConfigError for another layout, InputError for poses that no arm could follow (`checked_poses`).
+    """
     values = load_yaml(path)
     try:
         trajectory: dict[str, Any] = values["trajectory"]
@@ -28,7 +31,8 @@ def read_motion(path: Path, gripper: int = 0) -> tuple[str, TimedPoses, float]:
         position = np.array([t["translation"] for t in transforms], dtype=float)
         rotation = np.array([t["rotation"] for t in transforms], dtype=float)
         frame, rest = str(trajectory["frame_id"]), float(values.get("start", {}).get("rest_first", 0.0))
-        if not (position.shape == (len(times), 3) and rotation.shape == (len(times), 4) and len(times) and rest >= 0.0):
+        fits = position.shape == (len(times), 3) and rotation.shape == (len(times), 4)
+        if not (fits and len(times) and 0.0 <= rest < math.inf):
             raise ValueError(f"{len(times)} points of {position.shape[1:]} and {rotation.shape[1:]}, rest {rest}")
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         raise ConfigError(
@@ -37,6 +41,10 @@ def read_motion(path: Path, gripper: int = 0) -> tuple[str, TimedPoses, float]:
             allowed="trajectory: frame_id, points of time_from_start and transforms",
             next_step="Give the next_motion.yaml of pred diagnose",
         ) from error
+    try:
+        times, position, rotation = checked_poses(frame, times.tolist(), position, rotation)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
     return frame, TimedPoses(times, position, rotation), rest
 
 

@@ -83,18 +83,26 @@ class PlantArm:
 def connect_plant(
     host: str = HOST, port: int = PORT, patience: float = STARTING, sleep: Callable[[float], None] = time.sleep
 ) -> PlantArm:
-    """Connect to a plant node within `patience` [s]; `sleep` may end the waiting by an exception.
+    """Connect to a plant node that knows within `patience` [s] where its arm is; `sleep` may end the waiting by an
+    exception.
 
-    Raises: InputError if nobody answers.
+    Raises: InputError if nobody answers, or the plant has not begun by then.
     """
     end = time.monotonic() + patience
     while True:
         try:
             connection = socket.create_connection((host, port), timeout=PATIENCE)
-            break
         except OSError as error:
             if time.monotonic() > end:
                 raise InputError(f"plant: nobody at {host}:{port}", got=error, next_step=START_IT) from error
-            sleep(0.1)
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    return PlantArm(connection)
+        else:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            arm = PlantArm(connection)
+            try:
+                arm.read()
+                return arm
+            except InputError:
+                arm.close()
+                if time.monotonic() > end:
+                    raise
+        sleep(0.1)

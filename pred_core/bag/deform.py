@@ -167,6 +167,8 @@ def claim_folder(root: Path, source: dict[str, object]) -> None:
         root.mkdir(parents=True, exist_ok=True)
         for partial in root.glob(".*.part"):
             partial.unlink()
+        if [p.name for p in root.iterdir()] == [SOURCE_FILE]:
+            path.unlink()  # nothing came of it
         if not path.exists():
             if any(root.iterdir()):
                 raise DatasetError(f"{root}: not empty, and not begun by this command", next_step="Use a new folder")
@@ -178,11 +180,13 @@ def claim_folder(root: Path, source: dict[str, object]) -> None:
         raise DatasetError(f"{root}: cannot be used as a data set folder", got=error) from error
     if found != source:
         theirs = found if isinstance(found, dict) else {}
-        differ = [k for k in (*source, *theirs) if theirs.get(k) != source.get(k)]
+        if set(theirs) != set(source):
+            raise DatasetError(f"{root}: holds what another command has made", next_step="Use a new folder")
+        differ = [k for k in source if theirs.get(k) != source.get(k)]
         raise DatasetError(
             f"{root}: holds the data of another source or other settings",
-            got=", ".join(f"{k} {json.dumps(theirs.get(k))}" for k in dict.fromkeys(differ)),
-            allowed=", ".join(f"{k} {json.dumps(source.get(k))}" for k in dict.fromkeys(differ)),
+            got=", ".join(f"{k} {json.dumps(theirs[k])}" for k in differ),
+            allowed=", ".join(f"{k} {json.dumps(source[k])}" for k in differ),
             next_step=f"Use a new folder or remove {FILE}, {SOURCE_FILE} and the bags",
         )
 

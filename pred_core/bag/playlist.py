@@ -78,11 +78,12 @@ def _clip(path: Path, entry: EpisodeEntry, kind: str, points: bool) -> Clip:
         raise BagError(f"{path.name}: truncated or damaged bag, {reader.damage}", next_step="Record the episode again")
     cameras = tuple(camera_topics(reader.topics))
     pictures = [t for t in cameras if f"/{COLOR}" in t]
+    if not points and not pictures:
+        had = ", ".join(reader.topics) or "nothing"
+        raise BagError(f"{path.name}: no pictures of cameras", got=had, next_step="Record color/ and depth/ topics")
     points = points and (TRACKER_POINTS in reader.topics or not pictures)
     needed = REQUIRED if points else tuple(t for t in REQUIRED if t != TRACKER_POINTS)
     reader.require(needed)
-    if not points and not pictures:
-        raise BagError(f"{path.name}: without {TRACKER_POINTS} there is nothing to play", got="no pictures of cameras")
     leading = TRACKER_POINTS if points else pictures[0]
     begin, frames = _first_stamp(reader, leading), reader.topics[leading].count
     name = Path(entry.bag).stem

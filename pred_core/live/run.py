@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pred_core.bag.align import slerp
 from pred_core.bag.clouds import LARGEST_EXTENT, PointFrame
 from pred_core.bag.grippers import PoseFrame
+from pred_core.bag.in_line import InLine
 from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE, TRACKER_POINTS
 from pred_core.calibration import Calibration
 from pred_core.dynamics import Dynamics
@@ -57,6 +58,7 @@ class Run:
         self._rules = rules
         self._calibration = calibration or Calibration()
         self._delayed = DelayedPoses(self._calibration.delay, rules.max_gap) if self._calibration.delay else None
+        self._posed: InLine[tuple[PoseFrame, NDArray[np.bool_]]] = InLine(GRIPPER_POSE, rules.max_gap, rules.max_gap)
         self._period = round(dynamics.period * 1e9)  # [ns]
         self._frames: deque[tuple[Time, PointFrame]] = deque()
         self._poses: deque[Pose] = deque()
@@ -92,6 +94,7 @@ class Run:
         self._frames.clear()
         self._poses.clear()
         self._laps.clear()
+        self._posed.clear()
         if self._delayed is not None:
             self._delayed.clear()
         self._pose_lap, self._time, self._begin = 0, (-1, 0), (-1, 0)
@@ -117,9 +120,10 @@ class Run:
         self._take(TRACKER_POINTS, frame.stamp, lambda time: self._keep_frame(time, frame))
 
     def add_pose(self, pose: PoseFrame, closed: NDArray[np.bool_]) -> None:
-        """A gripper pose.
+        """A gripper pose. Where time goes back, or a hole has ended, it waits for the next one (in_line.py).
 
-        Raises: InputError if the flags do not match, a held particle has no gripper, or for its stamp (laps.py).
+        Raises: InputError if the flags do not match, a held particle has no gripper, for its stamp (laps.py), or, once
+        this one is taken, because the one before was out of line.
         """
         count = len(pose.position)
         if len(closed) != count:
@@ -130,9 +134,18 @@ class Run:
         if count < needed:
             raise InputError(f"{GRIPPER_POSE}: too few grippers for 'held'", got=count, allowed=f"{needed} or more")
         position, rotation = self._calibration.correct_pose(pose.position, pose.rotation)
-        pose = PoseFrame(pose.stamp, position, rotation)
-        for p, c in [(pose, closed)] if self._delayed is None else self._delayed.take(pose, closed):
-            self._take(GRIPPER_POSE, p.stamp, partial(self._keep_posed, p, c))
+        late: InputError | None = None
+        usable, wrong = self._posed.take(pose.stamp, (PoseFrame(pose.stamp, position, rotation), closed))
+        for taken in usable:
+            for p, c in [taken] if self._delayed is None else self._delayed.take(*taken):
+                try:
+                    self._take(GRIPPER_POSE, p.stamp, partial(self._keep_posed, p, c))
+                    late = None
+                except InputError as error:  # of two, the second confirms the first
+                    late = error
+        refused = wrong or late
+        if refused is not None:
+            raise refused
 
     def advance(self) -> Iterable[Prediction]:
         """Predictions that the data so far allow, oldest first."""

@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pred_core.bag.in_line import InLine
+from pred_core.bag.wire import GRIPPER_POSE
 from pred_core.config import setting
 from pred_core.errors import InputError
 from pred_core.types import Array
 
 KEPT = 2_000_000_000  # [ns] of gripper poses
+AHEAD = 0.5  # [s] by which a pose may leave the others behind and be believed at once
 
 
 @dataclass(frozen=True)
@@ -31,11 +34,22 @@ class GripperPath:
     def __init__(self) -> None:
         self._stamps: list[int] = []
         self._poses: list[tuple[Array, Array]] = []
+        self._line: InLine[tuple[int, Array, Array]] = InLine(GRIPPER_POSE, 0.0, AHEAD)
 
     def add(self, stamp: int, position: Array, rotation: Array) -> None:
-        """Poses (G, 3) [m] and (G, 4) wxyz at `stamp` [ns]. Raises: InputError if not finite."""
+        """Poses (G, 3) [m] and (G, 4) wxyz at `stamp` [ns]; two older than the last begin a new recording.
+
+        Raises: InputError if not finite, or, once this one is taken, because the one before was out of line.
+        """
         if not (np.isfinite(position).all() and np.isfinite(rotation).all()):
             raise InputError("gripper pose is not finite", next_step="Check the source of gripper/pose")
+        usable, wrong = self._line.take(stamp, (stamp, position, rotation))
+        for taken in usable:
+            self._keep(*taken)
+        if wrong is not None:
+            raise wrong
+
+    def _keep(self, stamp: int, position: Array, rotation: Array) -> None:
         if self._stamps and (stamp < self._stamps[-1] or position.shape != self._poses[-1][0].shape):
             self._stamps, self._poses = [], []  # a new recording
         if self._stamps and stamp == self._stamps[-1]:

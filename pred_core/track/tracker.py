@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pred_core.bag.wire import GRIPPER_CLOSED, GRIPPER_POSE
 from pred_core.config import setting
 from pred_core.errors import ConfigError, InputError, nearest
 from pred_core.track.estimate import Estimate, Prior
@@ -63,7 +64,7 @@ class Tracker:
         masks: Masks | None = None,
         follower: PointFollower | None = None,
     ):
-        """`masks`: a learned model's, beside workspace, table and colour; sheets and volumes are only found with them.
+        """`masks`: a learned model's, beside workspace, table and colour; sheets and volumes only begin there.
         `follower`: a learned model's point tracks, for sheets and volumes.
 
         Raises: ConfigError for no camera, more than eight, or an empty workspace.
@@ -97,9 +98,19 @@ class Tracker:
         return self._searching
 
     def add_grip(self, stamp: int, position: Array, rotation: Array, closed: NDArray[np.bool_]) -> None:
-        """Measured gripper poses (G, 3) [m], (G, 4) wxyz and flags (G,). Raises: InputError if not finite."""
-        self._path.add(stamp, position, rotation)
+        """Measured gripper poses (G, 3) [m], (G, 4) wxyz and flags (G,), () while they are not known yet.
+
+        Raises: InputError if not finite, for another number of flags, or for a stamp out of line (`GripperPath.add`).
+        """
+        if len(closed) not in (0, len(position)):
+            raise InputError(
+                f"{GRIPPER_CLOSED} does not match {GRIPPER_POSE}",
+                got=f"{len(closed)} flags",
+                allowed=len(position),
+                next_step="Send one flag a gripper",
+            )
         self._closed = closed
+        self._path.add(stamp, position, rotation)
 
     def set_prior(self, prior: Prior | None) -> None:
         """Where the predictor expects the particles; used until the next one, or for PRIOR_AGE."""
