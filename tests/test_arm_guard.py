@@ -241,6 +241,25 @@ def test_an_arm_that_does_not_follow_is_a_fault() -> None:
     assert guard.mode is Mode.FAULT
 
 
+def test_a_process_that_was_held_up_while_the_arm_moves_stops_it() -> None:
+    """The arm's own controller has stopped by then; set-points that went on at full speed would be a jump for it."""
+    guard, way, seen = armed(), np.array([0.05, 0.0, 0.0]), []
+    for k in range(60):
+        now = k * PERIOD
+        assert guard.command(HOME + way * (k / 125), DOWN, now, now) is None
+        seen.append(guard.tick(now))
+    assert guard.setpoint is not None and guard.setpoint.velocity[0] > 0.03
+    later = 59 * PERIOD + 1_300_000_000
+    assert guard.command(HOME + way, DOWN, later, later) is None
+    seen += [guard.tick(later + k * PERIOD) for k in range(60)]
+    assert guard.mode is Mode.FAULT and "no set-point for 1.300 s while moving" in guard.line
+    assert guard.at_rest and not broken(measure([s for s in seen if s is not None], guard.config))
+    still = armed()
+    still.tick(0)
+    still.tick(5_000_000_000)
+    assert still.mode is Mode.HOLDING, "at rest it may take its time"
+
+
 def test_armed_only_inside_the_limits() -> None:
     guard = Guard(GuardConfig())
     assert guard.tick(0) is None

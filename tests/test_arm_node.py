@@ -17,6 +17,7 @@ pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from arm_cases import broken, measure
 from geometry_msgs.msg import PoseArray, Quaternion, Transform, Vector3
+from rclpy.serialization import serialize_message
 from ros_bench import Bench, bench_of
 from sensor_msgs.msg import JointState
 from std_msgs.msg import UInt8MultiArray
@@ -29,7 +30,7 @@ from pred_core.arm.protocol import Reading, SetPoint
 from pred_core.bag.grippers import PoseFrame
 from pred_core.bag.wire import stamp_of
 from pred_core.errors import InputError
-from pred_ros import arm_node, convert, qos
+from pred_ros import arm_messages, arm_node, convert, qos
 from pred_ros.arm_node import ArmConfig, ArmNode
 from pred_ros.diagnostics import ERROR, OK, WARN
 from pred_ros.processes import free_domain, node_command, node_environment
@@ -142,7 +143,7 @@ def test_a_planner_that_dies_stops_the_arm_and_only_people_start_it_again() -> N
         assert world.enable().success
         world.send_plan(np.array([0.06, 0.0, 0.0]), 0.5, rest=False)
         world.bench.until(lambda: world.bench.says(WARN, "stopping"), "the ramp")
-        world.bench.until(lambda: world.bench.says(ERROR, "no command for 0.5 s"), "the latch")
+        world.bench.until(lambda: world.bench.says(ERROR, "the plan ended in motion", "call ~/reset"), "the latch")
         world.bench.until(lambda: world.guard.at_rest, "at rest, also when the machine is busy")
         world.wait(0.1)
         stopped = world.place()
@@ -239,6 +240,38 @@ class Measuring(DryRunArm):
         """As the plant does."""
         stamp = self.clock() // MEASURES * MEASURES + self.off
         return dataclasses.replace(super().read(), stamp=stamp)
+
+
+def test_a_plan_too_long_to_be_read_does_not_keep_the_arm_waiting() -> None:
+    """50,000 points took the node 1.3 s, in which it sent no set-point and heard no stop."""
+    points = [MultiDOFJointTrajectoryPoint(transforms=[Transform(rotation=Quaternion(x=1.0, w=0.0))])] * 50_000
+    long = MultiDOFJointTrajectory(joint_names=["gripper0"], points=points)
+    long.header.frame_id = "world"
+    data = serialize_message(long)
+    begin = time.process_time()
+    with pytest.raises(InputError, match="too long to be read while the arm moves; got .* allowed: 5,000 points"):
+        arm_messages.bytes_to_plan(data, ArmConfig())
+    assert time.process_time() - begin < 0.01
+    with arm_world() as world:
+        assert world.enable().success
+        world.plan_out.publish(long)
+        world.bench.until(lambda: world.bench.says(WARN, "refused: plan/trajectory: too long"), "the refusal")
+
+
+def test_a_refusal_is_the_headline_for_a_while_and_a_fault_stays_one() -> None:
+    with arm_world() as world:
+        assert world.enable().success
+        world.send_plan(np.array([2.0, 0.0, 0.0]), 0.5)
+        world.bench.until(lambda: world.bench.says(WARN, "refused: plan"), "the refusal")
+        world.bench.statuses.clear()
+        world.bench.until(lambda: world.bench.says(OK, "armed, waiting"), "what the arm does")
+        assert world.trigger("stop").success
+        world.bench.until(lambda: world.bench.says(ERROR, "stopped by service"), "the fault")
+        assert not world.enable().success
+        world.bench.until(lambda: world.bench.says(ERROR, "cannot arm"), "still an error")
+        world.bench.statuses.clear()
+        world.bench.until(lambda: world.bench.says(ERROR, "stopped by service"), "the fault again")
+        assert not any(s.level in (OK, WARN) for s in world.bench.statuses)
 
 
 def test_poses_bear_the_time_of_their_measurement(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,7 +45,12 @@ def test_a_pose_lies_between_two_and_is_not_taken_from_far_away() -> None:
     assert poses.at(S + 10_000_000, 0.05)[0][0, 0] == pytest.approx(0.15, abs=1e-12)
     with pytest.raises(InputError, match="no gripper/pose at the stamp of state/points; got 0.060 s away"):
         poses.at(S + 100_000_000, 0.05)
-    poses.add(pose(S - S // 2, x=0.7))  # a clock set back: what was before is forgotten
+    poses.add(pose(S - S // 2, x=0.7))  # one stamp out of line costs nothing
+    assert poses.at(S + 10_000_000, 0.05)[0][0, 0] == pytest.approx(0.15, abs=1e-12)
+    with pytest.raises(InputError, match="one stamp is out of line; got -0.540 s"):
+        poses.add(pose(S + 80_000_000, x=0.3))
+    for stamp in (S - S // 2, S - S // 2 + 1):  # a clock set back: what was before is forgotten
+        poses.add(pose(stamp, x=0.7))
     with pytest.raises(InputError, match="0.500 s away"):
         poses.at(S, 0.05)
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ from test_arm_node import DOWN, HOME, World, arm_world
 
 from pred_core.arm.approach import TimedPoses, with_approach
 from pred_core.arm.guard import Mode
+from pred_core.arm.plan_file import read_motion
+from pred_core.errors import ConfigError, InputError
 from pred_ros.commands import Interrupts
 
 BEGIN = HOME + (0.0, 0.06, 0.02)
@@ -101,6 +104,44 @@ def executed_alone(*arguments: str) -> tuple[int, str, str]:
     """`pred_motion` without an arm node."""
     done = subprocess.run([sys.executable, "-m", "pred_ros.motion", *arguments], capture_output=True, text=True)
     return done.returncode, done.stdout, done.stderr.strip().splitlines()[-1]
+
+
+def _moved(point: dict, times: float) -> dict:
+    return {**point["transforms"][0], "translation": [times * v for v in point["transforms"][0]["translation"]]}
+
+
+BAD_MOTIONS: dict[str, tuple[Callable[[dict, int], dict], str]] = {
+    "times that fall": (lambda p, k: {"time_from_start": 3.0 - p["time_from_start"]}, "times do not increase"),
+    "a time that is no number": (lambda p, k: {"time_from_start": math.nan if k == 5 else 0.1 * k}, "not finite"),
+    "millimetres": (lambda p, k: {"transforms": [_moved(p, 1e3)]}, "out of reach at point"),
+    "no rotation": (lambda p, k: {"transforms": [_moved(p, 1.0) | {"rotation": [0.0] * 4}]}, "without unit norm"),
+}
+
+
+@pytest.mark.parametrize(("change", "said"), BAD_MOTIONS.values(), ids=BAD_MOTIONS)
+def test_a_motion_that_no_arm_could_follow_is_refused_before_anything_is_sent(
+    change: Callable[[dict, int], dict], said: str, tmp_path: Path
+) -> None:
+    values = yaml.safe_load(motion_file(tmp_path / "good.yaml").read_text())
+    values["trajectory"]["points"] = [p | change(p, k) for k, p in enumerate(values["trajectory"]["points"])]
+    (tmp_path / "bad.yaml").write_text(yaml.safe_dump(values))
+    with pytest.raises(InputError, match=f"bad.yaml: plan.*{said}"):
+        read_motion(tmp_path / "bad.yaml")
+    values["start"]["rest_first"] = math.inf
+    (tmp_path / "rests.yaml").write_text(yaml.safe_dump(values))
+    with pytest.raises(ConfigError, match="rests.yaml: not a motion"):
+        read_motion(tmp_path / "rests.yaml")
+
+
+def test_a_way_too_long_for_one_plan_is_not_sent(tmp_path: Path) -> None:
+    values = yaml.safe_load(motion_file(tmp_path / "far.yaml").read_text())
+    for point in values["trajectory"]["points"]:
+        point["transforms"][0]["translation"][0] += 5.0
+    (tmp_path / "far.yaml").write_text(yaml.safe_dump(values))
+    with arm_world(lifetime=600.0) as world:
+        assert world.enable().success
+        code, _, line = executed(world, str(tmp_path / "far.yaml"), "--approach", "0.005")
+        assert code == 2 and "too long for one plan" in line and world.guard.counts.total() == 0
 
 
 def test_a_warning_does_not_end_it(tmp_path: Path) -> None:

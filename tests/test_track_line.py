@@ -224,6 +224,28 @@ def test_a_line_whose_held_side_is_hidden_is_waited_for_but_not_for_ever() -> No
     assert not fresh._is_half_seen(path, START, away, ~closed) and not fresh._is_half_seen(path, START, None, closed)
 
 
+def test_one_pose_out_of_line_is_named_and_the_path_goes_on() -> None:
+    path, still = GripperPath(), np.array([[1.0, 0.0, 0.0, 0.0]])
+    for k in range(10):
+        path.add(START + k * 10_000_000, np.full((1, 3), 0.01 * k), still)
+    path.add(START - 20 * 10**9, np.ones((1, 3)), still)
+    with pytest.raises(InputError, match="gripper/pose: one stamp is out of line; got -20.090 s"):
+        path.add(START + 100_000_000, np.full((1, 3), 0.1), still)
+    found = path.at(START + 95_000_000)
+    assert found is not None and found[0][0, 0] == pytest.approx(0.095)
+    for k in range(2):  # a recording played again
+        path.add(START + k * 10_000_000, np.zeros((1, 3)), still)
+    assert path.at(START + 95_000_000) is None or path.at(START + 95_000_000)[0][0, 0] == 0.0
+
+
+def test_flags_of_other_grippers_are_refused(tracker: Tracker, scene: HangingRope) -> None:
+    feed(tracker, scene, START)
+    for flags in ([True, True], [True, True, False]):
+        with pytest.raises(InputError, match=f"gripper/closed does not match gripper/pose; got {len(flags)} flags"):
+            tracker.add_grip(**{**scene.grip(START + STEP), "closed": np.array(flags)})
+    assert feed(tracker, scene, START + STEP).status == "tracking"
+
+
 def test_poses_are_awaited_only_near_their_time() -> None:
     """A gripper whose clock is far ahead or behind keeps nobody waiting."""
     path, still = GripperPath(), np.array([[1.0, 0.0, 0.0, 0.0]])

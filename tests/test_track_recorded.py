@@ -80,6 +80,18 @@ def test_it_is_causal_and_repeatable(tmp_path: Path) -> None:
     assert tracks["again"] == tracks["long"]
 
 
+def test_a_refused_run_does_not_claim_the_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    source, out = cut(tmp_path / "source.mcap", 4), tmp_path / "set"
+    assert track(source, out, "--cameras", "cam0 cam7") == 2
+    assert track(source, out, "--held", "0:5") == 2
+    assert "held names gripper 5; got 1 grippers; allowed: 0 to 0" in capsys.readouterr().err
+    assert track(source, out, "--held", "300:0") == 2
+    assert "300" in capsys.readouterr().err and not (out / FILE).exists()
+    assert track(source, out, "--held", "0:0") == 0 and load_dataset(out).held == {0: 0}
+    assert track(source, out, "--cameras", "cam0 cam1") == 2
+    assert "holds the data of another source or other settings" in capsys.readouterr().err
+
+
 def test_cameras_are_found_whatever_their_drivers_call_them(tmp_path: Path) -> None:
     tracks = {}
     for name in ("cam", "cells/left/realsense"):
@@ -164,7 +176,7 @@ def other_clock(message: BagMessage) -> Any:
 BAD: tuple[tuple[str, Change, tuple[str, ...], str], ...] = (
     ("nothing of the arm", lambda m: m.topic != GRIPPER_POSE, (), "no topic 'gripper/pose'"),
     ("no calibration", no_calibration, (), "calibration missing"),
-    ("no pictures", lambda m: "/color/image" not in m.topic, (), "nothing to play"),
+    ("no pictures", lambda m: "/color/image" not in m.topic, (), "no pictures of cameras; got cam0"),
     ("another camera", lambda m: True, ("--cameras", "cam0 cam7"), "no camera 'cam7'"),
     ("nothing there", lambda m: True, ("--x-low", "-0.7", "--x-high", "-0.3"), "never found"),
     ("unknown kind", lambda m: True, ("--kind", "rope"), "allowed: line, sheet, volume"),

@@ -29,20 +29,20 @@ class InLine(Generic[T]):
     def take(self, stamp: int, item: T) -> tuple[list[T], InputError | None]:
         """What can be used now, oldest first, and why the message before this one cannot, where it was out of line."""
         held, self._held = self._held, None
+        wrong = None if held is None or self._newest is None else self._refusal(held[0], self._newest)
         if self._newest is None or -self._back <= stamp - self._newest <= self._ahead:
             self._newest = stamp if self._newest is None else max(stamp, self._newest)
-            return [item], None if held is None else self._refusal(held[0])
+            return [item], wrong
         if held is not None and 0 <= stamp - held[0] <= CONFIRMS * NS:
             self._newest = stamp
             return [held[1], item], None
         self._held = stamp, item
-        return [], None if held is None else self._refusal(held[0])
+        return [], wrong
 
-    def _refusal(self, stamp: int) -> InputError:
-        assert self._newest is not None
+    def _refusal(self, stamp: int, newest: int) -> InputError:
         return InputError(
             f"{self._topic}: one stamp is out of line",
-            got=f"{(stamp - self._newest) / NS:+.3f} s from those around it",
+            got=f"{(stamp - newest) / NS:+.3f} s from the one before",
             allowed=f"{-self._back / NS:+g} to {self._ahead / NS:+g} s",
             next_step="It was not used; check the sender's clock",
         )
