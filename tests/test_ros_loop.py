@@ -140,7 +140,7 @@ def test_a_killed_node_is_gone_and_comes_back_under_watch(tmp_path: Path, monkey
     nodes = {"tracker": {"for": 300.0}, "arm": {"for": 300.0}}
     watch: Any = SimpleNamespace(record=record_of([(0.0, 0.0)]), spin=time.sleep)
     with Children(dict(os.environ), tmp_path) as children:
-        loop = reroute_loop.Loop(reroute_loop.Job(nodes, np.zeros((1, 3)), tmp_path), children, watch)
+        loop = reroute_loop.Loop(reroute_loop.Job(nodes, np.zeros((1, 3)), tmp_path, 60.0), children, watch)
         for node, parameters in nodes.items():
             children.start(node, reroute_loop.node_command(node, parameters))
         loop.kill("tracker")

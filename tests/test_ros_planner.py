@@ -298,7 +298,8 @@ def test_bad_states_are_refused_with_the_reason(files: dict[str, str]) -> None:
         world.bench.until(lambda: world.bench.says(ERROR, "ids [2] are not finite"), "NaN is named")
         world.see(position=1e3 * (HOME + LINE))
         world.bench.until(lambda: world.bench.says(ERROR, "state/points", "millimetres?"), "the unit is named")
-        world.see(stamp=world.now() - 2_000_000_000)
+        for stamp in (0, 10_000_000):  # one pose alone would be out of line
+            world.see(stamp=world.now() - 2_000_000_000 + stamp)
         world.bench.until(lambda: world.bench.says(ERROR, "state is too old"), "age is named")
         world.see(stamp=world.now() + 300_000_000, pose=False)
         world.bench.until(lambda: world.bench.says(ERROR, "no gripper/pose at the stamp"), "the missing pose is named")

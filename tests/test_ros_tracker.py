@@ -262,10 +262,11 @@ def test_one_refused_message_takes_nothing_else_with_it(rig: Rig) -> None:
     node: Any = rig.bench.node
     with node._lock:  # the worker finds all of it at once
         bad = functools.partial(node._add_grip, pose=PoseFrame(START, np.full((1, 3), np.nan), TURN), closed=CLOSED)
-        good = functools.partial(
-            node._add_grip, pose=PoseFrame(9 * START, rig.scene.gripper[None], TURN), closed=CLOSED
+        good, next_one = (
+            functools.partial(node._add_grip, pose=PoseFrame(at, rig.scene.gripper[None], TURN), closed=CLOSED)
+            for at in (9 * START, 9 * START + 1)
         )
-        node._news.extend([bad, good])
+        node._news.extend([bad, good, next_one])
         answer = node._on_reset(Trigger.Request(), Trigger.Response())
     rig.bench.until(lambda: rig.bench.says(ERROR, "gripper pose is not finite"), "the refusal")
     rig.bench.until(lambda: node._tracker._path.at(9 * START) is not None, "the pose after it")
