@@ -36,7 +36,6 @@ from pred_ros.reroute_faults import FAULTS, Fault
 from pred_ros.reroute_loop import BAG, Job, run
 from pred_ros.reroute_report import PAGE, VIDEO, lead, outcome, write_report
 from pred_ros.reroute_verdict import Verdict, judge
-from pred_ros.reroute_video import missing_pictures
 from pred_ros.resources import config_folder
 
 NOT_REACHED = 1
@@ -76,8 +75,8 @@ def go(args: argparse.Namespace) -> int:
     print(lead(verdict) if fault is None else f"{fault.name}: {outcome(verdict)}")
     print(f"   report {args.out / PAGE}\n   bag    {args.out / BAG}")
     if not args.no_pictures:
-        lost = missing_pictures(record)
-        print(f"   video  {args.out / VIDEO}" + (f"; {lost} pictures did not come" if lost else ""))
+        lost = max(0, record.taken - len(record.pictures))
+        print(f"   video  {args.out / VIDEO}" + (f"; {lost} of {record.taken} pictures did not come" if lost else ""))
     return 0 if passed(verdict, fault) else NOT_REACHED
 
 

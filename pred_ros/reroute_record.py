@@ -63,6 +63,7 @@ class Record:
     values: dict[str, dict[str, str]] = field(default_factory=dict)  # node -> newest values
     status: dict[str, Said] = field(default_factory=dict)  # node -> newest status
     pictures: list[tuple[int, bytes]] = field(default_factory=list)  # JPEG
+    taken: int = 0  # pictures whose calibration came, which is small and hardly ever lost
     view: View | None = None
     events: list[tuple[int, str]] = field(default_factory=list)  # what the run itself did: faults, restarts
     now: int = 0  # [ns]

@@ -61,12 +61,6 @@ def spacing_of(stamps: Sequence[int]) -> float:
     return float(np.quantile(np.diff(stamps), 0.1)) if len(stamps) > 1 else 0.1 * NS
 
 
-def missing_pictures(record: Record) -> int:
-    """How many pictures between the first and the last one did not come."""
-    stamps = [s for s, _ in record.pictures]
-    return max(0, round((stamps[-1] - stamps[0]) / spacing_of(stamps)) + 1 - len(stamps)) if stamps else 0
-
-
 def closer(record: Record, view: View, width: int, height: int) -> tuple[View, Array]:
     """The camera that sees only the part in which goal and rope lie, enlarged to SIZE, and that part (2, 3): its pixels
     from those of a picture of width x height. Where nothing lies in front of the camera: the middle.

@@ -191,6 +191,7 @@ class Watch:
 
     def _on_info(self, message: CameraInfo) -> None:
         self._intrinsics = images.read_camera_info(message, f"{self._camera}/{images.INFO}")[0]
+        self.record.taken += 1
 
     def _on_camera_pose(self, message: PoseStamped) -> None:
         pose = images.read_camera_pose(message, f"{self._camera}/{images.POSE}")

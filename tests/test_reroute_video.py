@@ -59,8 +59,6 @@ def test_where_pictures_are_missing_the_one_before_stays_for_their_time(tmp_path
     while film.read()[0]:
         frames += 1
     assert film.get(cv2.CAP_PROP_FPS) == pytest.approx(10.0) and frames == 22, "2.2 s from the first to after the last"
-    assert reroute_video.missing_pictures(record) == 15
-
 
 def test_the_part_is_found_once_for_all_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, original = [], reroute_video.closer
