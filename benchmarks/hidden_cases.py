@@ -22,7 +22,8 @@ SESSION = SessionConfig(train=12, test=4, ood=3, seconds=4.0)
 SETS = ("final", "seen", "dev", "extents")
 SIZED = ("attraction", "sticky_patch", "gripper_slip", "heavy_tip", "stiff_region")  # their size starts a search too
 REFERENCES = (50000, 51000, 52000, 53000)
-# Draws that were looked at: seeds of the cases from, seed of the draw, controls, how many of its cases.
+# Draws that were looked at: seeds of the cases from, seed of the draw, controls, how many of its cases. (case52000 has
+# the seed of a reference, which was not its own.)
 SEEN = (
     (50100, 2, 40, 29), (50200, 3, 42, 106), (50500, 4, 40, 34), (50700, 5, 40, 64), (51100, 6, 40, 78),
     (51400, 7, 40, 102), (51600, 8, 40, 102), (51900, 10, 40, 102),
