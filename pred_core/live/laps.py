@@ -110,7 +110,8 @@ class Laps(Generic[T]):
         return stamp - own.newest > self._late
 
     def _undo_lap(self, own: _Topic[T]) -> None:
-        own.lap, own.newest, own.fell_from = own.lap - 1, own.fell_from or own.newest, None
+        assert own.fell_from is not None  # `_is_back`
+        own.lap, own.newest, own.fell_from = own.lap - 1, own.fell_from, None
         for other in self._topics.values():
             if other.lap == own.lap:
                 other.left_at = None

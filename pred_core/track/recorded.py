@@ -100,11 +100,13 @@ def track_dataset(
     Raises: PredError for a bag without usable pictures, or where the object is not found or long out of sight.
     """
     clips = find_clips(source, points=False)
-    for clip in clips if held is not None else ():
-        _check_grippers(clip, held or {})
+    said = held or {}
+    for clip in clips:
+        _check_grippers(clip, said)
     counts, rate = track_bags(clips, settings, root, progress)
-    for clip in clips if held is not None else ():
-        read_episode(root / f"{clip.name}.mcap", held=held)  # whether its particles are there
+    if said:
+        for clip in clips:
+            read_episode(root / f"{clip.name}.mcap", held=said)  # whether its particles are there
     known = load_dataset(source) if (source / FILE).is_file() else None
     theirs = [e.held for e in known.entries] if known is not None and held is None else [None] * len(clips)
     entries = [
@@ -123,13 +125,14 @@ def track_dataset(
 
 def _check_grippers(clip: Clip, held: Mapping[int, int]) -> None:
     """Raises: BagError if particles are said to be in a gripper that the bag does not have."""
-    for message in open_bag(clip.path).read_messages((GRIPPER_POSE,)):
-        count = len(read_gripper_pose(message.decode(), message.where).position)
-        if (most := max(held.values(), default=0)) >= count:
-            raise BagError(
-                f"{clip.path.name}: held names gripper {most}", got=f"{count} grippers", allowed=f"0 to {count - 1}"
-            )
+    if not held:
         return
+    first = next(iter(open_bag(clip.path).read_messages((GRIPPER_POSE,))))
+    count, most = len(read_gripper_pose(first.decode(), first.where).position), max(held.values())
+    if most >= count:
+        raise BagError(
+            f"{clip.path.name}: held names gripper {most}", got=f"{count} grippers", allowed=f"0 to {count - 1}"
+        )
 
 
 def _show(progress: Progress, before: int, total: int, name: str, shown: int) -> None:
