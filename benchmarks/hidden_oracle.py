@@ -52,8 +52,9 @@ def oracle(case: Case, work: Path, twin: Path, answer: Path) -> dict[str, Any]:
         z = _fitted(bench, effects, known)
         space = bench.trial(effects).space
         extended, values = with_values(bench.twin, space.candidate(z)), space.values(z)
+    begin = min(int(e.stamps[0]) for e in episodes)  # of the session: what drifts began there
     errors = {
-        split: episode_errors(extended, [e for e in episodes if e.split == split]).mean
+        split: episode_errors(extended, [e for e in episodes if e.split == split], begin).mean
         for split in ("test", "ood")
         if any(e.split == split for e in episodes)
     }

@@ -21,7 +21,7 @@ from pred_core.diagnose.errors import episode_errors
 from pred_core.diagnose.gate import GateCause, GateResult
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.progress import Named, Progress
-from pred_core.diagnose.ranking import UNSEEN, nothing, ranking
+from pred_core.diagnose.ranking import UNSEEN, explains, nothing, ranking
 from pred_core.diagnose.result import Cause, Diagnosis, Value
 from pred_core.diagnose.said import called, confusions, sentence, unproven, without_interval
 from pred_core.effects import LIBRARY, find_effect
@@ -249,12 +249,15 @@ def delay_of(closed: float | None) -> Cause:
         ((delay_of(0.2), dataclasses.replace(delay_of(0.15), id="camera_scale")), False, "named"),
         ((delay_of(0.2), Cause("wind", "wind", 0.7, {}, False, 0.15)), False, "named"),  # 0.2 + 0.8 x 0.15 = 0.32
         ((delay_of(0.2), Cause("wind", "wind", 0.7, {}, False, 0.10)), False, "unknown"),  # 0.28
-        ((Cause("wind", "wind", 0.7, {}, False, 0.29),), False, "unknown"),
+        ((Cause("wind", "wind", 0.3, {}, False, 0.34),), False, "unknown"),
+        ((Cause("wind", "wind", 0.6, {}, False, 0.46),), False, "named"),
         ((), False, "unknown"),
     ],
 )
 def test_what_was_measured_counts_as_explained(causes: tuple[Cause, ...], cold: bool, outcome: str) -> None:
-    """Where something is left, 30 % of the excess must be explained for a name, by sensor causes as by physics."""
+    """Where something is left, what was measured must explain 30 % of the excess for a name, by sensor causes as by
+    physics; physics alone 45 %, from where it is more probable than something unknown."""
+    assert explains(0.45) == 0.5
     progress: Any = progress_of((0, 1))
     progress.unknown = True
     progress.bench.reference = None if cold else object()

@@ -18,7 +18,7 @@ from pred_core.diagnose.judge import Bench, Tell
 from pred_core.diagnose.naming import exploratory, one_recording
 from pred_core.diagnose.next_motion import propose
 from pred_core.diagnose.progress import Progress
-from pred_core.diagnose.ranking import ranking
+from pred_core.diagnose.ranking import EVEN, ranking
 from pred_core.diagnose.result import Cause, Diagnosis, Errors
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.said import not_identifiable, sentence, unproven, without_interval
@@ -26,7 +26,7 @@ from pred_core.twin import Twin
 from pred_core.types import Episode
 
 CHEAP = 2.0  # [s] that replaying the given twin may take, for what refining changed
-PARTLY = 0.3  # share of the excess from which a cause is the answer although something is left
+PARTLY = 0.3  # share of the excess from which what was measured is the answer although something is left
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,13 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
 
 
 def outcome_of(causes: Sequence[Cause], progress: Progress) -> str:
-    """One of OUTCOMES, from what was found and whether something is left: with too little explained it is unknown."""
+    """One of OUTCOMES, from what was found and whether something is left: with too little explained it is unknown.
+
+    A law that was fitted must then be the answer more probably than not; what the gate measured is there by itself.
+    """
     physics = [c for c in causes if not c.measured]
     cold = progress.bench.reference is None  # nobody knows there how much there is to explain
-    least = progress.bench.config.enough if cold else PARTLY
+    least = progress.bench.config.enough if cold else EVEN if len(physics) == len(causes) else PARTLY
     if physics and physics[0].contradicted:  # only the nearest law
         return "unknown"
     if progress.unknown and explained_by(causes) < least:

@@ -34,7 +34,7 @@ class Judged:
     null: dict[str, float]  # knob -> value without the change: off, or what the reference says
     intervals: dict[str, tuple[float, float]]  # 90 %, by leaving out recordings
     # Parameters for an episode whose recording is fitted are one step from the joint fit, taken without that recording
-    # (`fit.without_groups`); for any other they are the joint fit's.
+    # (`left_out.without_each`); for any other they are the joint fit's.
     gain: Array  # (E,) loss saved on each episode
     acts: NDArray[np.bool_]  # (E,) it moves the episode by itself, whatever is refitted beside it
     extended: Array  # (E,) loss with it

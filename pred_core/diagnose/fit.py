@@ -233,19 +233,3 @@ def _within(
         if needed(cut) <= limit and (cut != z).any():
             return cut
     return None
-
-
-def without_groups(result: Fit, space: SearchSpace, groups: NDArray[np.int64]) -> dict[int, Array]:
-    """group -> coordinates that the other groups' episodes give, by one Newton step from the fit; groups (E,)."""
-    lower, upper = (np.array(b) for b in space.bounds())
-    points = {}
-    size = len(result.z)
-    for group in sorted(set(groups.tolist())):
-        rest = groups != group
-        if not rest.any():
-            continue
-        h = result.curvature[rest].mean(axis=0) + PRIOR * np.eye(size)
-        h += 1e-6 * np.trace(h) / size * np.eye(size)
-        move = -np.linalg.solve(h, result.gradient[rest].mean(axis=0) - result.gradient.mean(axis=0))
-        points[int(group)] = np.clip(result.z + np.clip(move, -LONGEST, LONGEST), lower, upper)
-    return points

@@ -16,10 +16,11 @@ import numpy as np
 
 from pred_core.diagnose.commission import with_values
 from pred_core.diagnose.evidence import Judged, family_wise
-from pred_core.diagnose.fit import fit, without_groups
+from pred_core.diagnose.fit import fit
 from pred_core.diagnose.gate_result import GateResult
 from pred_core.diagnose.journal import vector
-from pred_core.diagnose.judge import Bench, Tell, intervals
+from pred_core.diagnose.judge import Bench, Tell, intervals, standing_of
+from pred_core.diagnose.left_out import without_each
 from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.trial import Trial, make_trial, switch
 from pred_core.effects import LIBRARY, find_effect
@@ -81,12 +82,19 @@ def _check(progress: Progress, named: Named, id: str, laws: int, tell: Tell) -> 
     p = min(1.0, laws * float(family_wise([test], bench.config.seed, bench.target.roller.sample.groups)[0]))
     tell(f"form of {id}: power {power:.2f} [{low:.2f}, {high:.2f}] for {listed:g}, gain {gain.mean():.3f}, p {p:.3g}")
     apart = low > listed + APART or high < listed - APART
-    if not apart or p > bench.config.level or float(gain.mean()) < WORTH * named.judged.mean:
+    if not apart or p > bench.config.level or float(gain.mean()) < WORTH * _saved(progress, named):
         return
     said = f"its power is {power:.2f} [{low:.2f}, {high:.2f}], not {listed:g} (p {p:.2g})"
     twin = with_values(other.twin, free.trial.space.candidate(free.z))
     instead = dataclasses.replace(named, judged=j, group=(), contradicted=said)
     progress.replace(named, instead, dataclasses.replace(other, twin=twin))
+
+
+def _saved(progress: Progress, named: Named) -> float:
+    """Mean loss that a name took away, in the units of the present round."""
+    n = progress.named.index(named)
+    before, after = (standing_of(t, progress.bench.target).mean() for t in progress.twins[n : n + 2])
+    return float(before - after)
 
 
 def _in_form(bench: Bench, id: str, form: type[Effect]) -> Bench:
@@ -115,12 +123,11 @@ def _refit(progress: Progress, bench: Bench, key: str) -> _Refit:
 
     def work() -> dict[str, object]:
         found = fit(bench.fitted, trial.space, trial.space.start(), STEPS)
-        left_out = without_groups(found, trial.space, groups[bench.train])
-        losses = target.losses(trial.space, [found.z, *left_out.values()])
-        crossed = losses[0].copy()
-        for row, group in enumerate(left_out if bench.config.cross_fit else ()):
-            crossed[groups == group] = losses[1 + row][groups == group]
-        rows = [p.tolist() for p in left_out.values()] or [found.z.tolist()]
+        left_out = without_each(target, trial.space, found, bench.train)
+        crossed = target.losses(trial.space, [found.z])[0]
+        for group, other in left_out.items() if bench.config.cross_fit else ():
+            crossed[groups == group] = other.loss[groups == group]
+        rows = [other.z.tolist() for other in left_out.values()] or [found.z.tolist()]
         return {"z": found.z.tolist(), "left_out": rows, "losses": crossed.tolist()}
 
     def read(v: Any) -> _Refit:

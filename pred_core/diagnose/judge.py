@@ -10,16 +10,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 from torch import Tensor
 
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.evidence import ACTS, FEWEST_ACTING, Judged
-from pred_core.diagnose.fit import IN_FULL, USUAL, Target, fit, graduated, rho, without_groups
+from pred_core.diagnose.fit import IN_FULL, USUAL, Target, fit, graduated, rho
 from pred_core.diagnose.journal import Journal, vector
+from pred_core.diagnose.left_out import without_each
 from pred_core.diagnose.places import Start
+from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.search import starts
 from pred_core.diagnose.trial import Trial, make_trial, scanned
 from pred_core.effects.effect import Effect
+from pred_core.identify.space import Candidate
 from pred_core.twin import Twin
 from pred_core.types import Array
 
@@ -27,6 +31,11 @@ KEPT_STARTS = 4
 ON_THE_WAY, STILL_FALLING = 3, 0.75  # times these steps are taken again, while the loss falls to this share
 HARDLY = 0.02  # of the reference's loss: what a candidate saves there is no reason to take it for what is usual
 QUICK, TRIED = 2, 2  # steps, and starts, of a candidate before it is told whether it goes on
+TRUST, Z = 0.95, 1.645  # of a one-sided bound: 90 % between two; normal deviate of it
+# Relative standard error of a parameter between two engines, beyond the scatter over recordings: from development
+# cases. Engines differ most in sliding: a coefficient that is high in one acts like a lower one in another.
+MISMATCH, SLIDING = 0.10, 0.30
+SLIDES = ("friction", "patch", "drift", "slip")  # families
 Tell = Callable[[str], None]
 Effects = tuple[type[Effect], ...]
 
@@ -64,8 +73,14 @@ class Bench:
 
     def standing(self) -> Array:
         """(E,) losses of the suspect set as the twin is."""
-        space = make_trial(self.twin, (), ()).space
-        return self.target.losses(space, [space.start()])[0]
+        return standing_of(self.twin, self.target)
+
+
+def standing_of(twin: Twin, target: Target) -> Array:
+    """(E,) losses of a target as a twin is, whatever the body the target was made with."""
+    roller = target.roller if twin.body is target.roller.twin.body else Roller(twin, target.roller.sample)
+    u = roller.errors([Candidate(twin.physics, twin.extensions)], target.stride) * target.weights[..., None]
+    return target.losses_of(u)[0]
 
 
 def scaled(bench: Bench) -> Bench:
@@ -203,21 +218,21 @@ def _judge(bench: Bench, screened: Screened) -> dict[str, object]:
     result = graduated(bench.fitted, trial.space, screened.starts[0].z, bench.config.iterations, trial.most)
     null = null_of(bench, screened, result.z)
     sample = target.roller.sample
-    left_out = without_groups(result, space, sample.groups[train])
+    left_out = without_each(target, space, result, train)
     own = [any(k.name.startswith(f"{id}.") for id in trial.ids) for k in space.knobs]
     without = np.where(own, null, result.z)  # what is refitted beside it moves episodes in which it does nothing
-    u = target.residuals(space, [null, result.z, without, *left_out.values()])
+    u = target.residuals(space, [null, result.z, without])
     losses = target.losses_of(u)
     extended = losses[1].copy()
-    for row, group in enumerate(left_out if bench.config.cross_fit else ()):
+    for group, other in left_out.items() if bench.config.cross_fit else ():
         mine = sample.groups == group  # also test episodes of that recording
-        extended[mine] = losses[3 + row][mine]
+        extended[mine] = other.loss[mine]
     moved = _moved(target, u[1] - u[2])
     few = int((moved > ACTS).sum()) < FEWEST_ACTING
     return {
         "z": result.z.tolist(),
         "null": null.tolist(),
-        "left_out": [p.tolist() for p in left_out.values()] or [result.z.tolist()],
+        "left_out": [other.z.tolist() for other in left_out.values()] or [result.z.tolist()],
         "gain": (losses[0] - extended).tolist(),
         "extended": extended.tolist(),
         "moved": moved.tolist(),
@@ -245,22 +260,18 @@ def _moved(target: Target, difference: Tensor) -> Array:
 
 
 def intervals(trial: Trial, z: Array, null: Array, left_out: Array) -> dict[str, tuple[float, float]]:
-    """90 %, as values: the jackknife over recordings (Efron 1982) and what simulations of one rope differ by."""
+    """90 %, as values: the jackknife over recordings (Efron 1982) and what simulations of one rope differ by, relative
+    to the change for what switches a cause on, to a typical change for where it is and how it is shaped."""
     groups = len(left_out)
     if groups < 2:
         return {k.name: (k.low, k.high) for k in trial.space.knobs}
     centre = left_out.mean(axis=0)
     error = np.sqrt((groups - 1) / groups * ((left_out - centre) ** 2).sum(axis=0))
     mismatch = SLIDING if set(trial.family.split("+")) & set(SLIDES) else MISMATCH
-    width = np.hypot(JACKKNIFE.get(groups, 1.8) * error, 1.645 * mismatch * np.abs(z - null))
+    size = np.ones(len(z))  # of a place, a range, a power: a typical change; they have no "off" to be relative to
+    size[list(trial.amplitudes)] = np.abs(z - null)[list(trial.amplitudes)]
+    width = np.hypot(student.ppf(TRUST, groups - 1) * error, Z * mismatch * size)
     return {
         k.name: (k.value(float(z[n] - width[n])), k.value(float(z[n] + width[n])))
         for n, k in enumerate(trial.space.knobs)
     }
-
-
-# Relative standard error of a parameter between two engines, beyond the scatter over recordings: from development
-# cases. Engines differ most in sliding: a coefficient that is high in one acts like a lower one in another.
-MISMATCH, SLIDING = 0.10, 0.30
-SLIDES = ("friction", "patch", "drift", "slip")  # families
-JACKKNIFE = {2: 6.31, 3: 2.92, 4: 2.35, 5: 2.13, 6: 2.02, 7: 1.94, 8: 1.89}  # Student's t, 95 %, groups - 1

@@ -79,9 +79,8 @@ def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress
     """Why a candidate is not named; "" if it may be. `excess` of the base's loss over `floor`, below 0 if under it."""
     config = progress.bench.config
     cold = progress.bench.reference is None
-    first = progress.rounds[0] if progress.rounds else None
     without = floor + excess
-    whole = max(excess, 0.0) if first is None or cold else max(float(first.base.mean()) - first.floor, excess, 0.0)
+    whole = max(excess, 0.0) if not progress.rounds or cold else max(progress.whole(), excess, 0.0)
     least = max((config.cold_gate if cold and progress.well else config.gate) * whole, STANDING * floor)
     if without - j.left < HALF * least:  # what it saves beside the reference's value is not saved beside "off"
         return f"leaves {j.left:.3f} of the loss, where {without:.3f} are left without it"

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.journal import Journal
-from pred_core.diagnose.judge import Bench
+from pred_core.diagnose.judge import Bench, standing_of
 from pred_core.twin import Twin
 from pred_core.types import Array
 
@@ -57,6 +57,20 @@ class Progress:
     explained: float | None = None  # share of the motion, in the end; None: the object hardly moves
     well: bool = True  # the twin of this round explains the motion as far as is usual where nothing is hidden
     notes: list[str] = field(default_factory=list)
+    first: Bench = field(init=False)  # before anything was named
+    _whole: tuple[Bench, float] | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        self.first = self.bench
+
+    def whole(self) -> float:
+        """Excess loss before anything was named, in the units of the present round: the loss that counts as usual of a
+        window falls with every name, and with it what a window that is far off counts."""
+        if self._whole is None or self._whole[0] is not self.bench:
+            bench, first = self.bench, self.first
+            floor = 0.0 if bench.reference is None else standing_of(first.reference_twin, bench.reference).mean()
+            self._whole = bench, float(standing_of(first.twin, bench.target).mean() - floor)
+        return self._whole[1]
 
     def add(self, named: Named, bench: Bench) -> None:
         """Take a name, and the bench that has it."""

@@ -15,13 +15,12 @@ OCCAM = 0.5  # weight of a rival for each parameter that it has beyond the best 
 COLD = 0.8  # without a reference: what engine and object lack in common can look like a cause
 UNSEEN = 0.05  # probability left for "none" where no candidate explains what is seen, and for a law the data contradict
 FOUND = 0.88, 0.05  # share of hidden effects (75 of 85 seen cases) that give a family-wise p below this
-EXPLAINS = (0.45, 8.0)  # share of the excess closed at which "it explains it" is even, and how steeply that rises
+EVEN, STEEP = 0.45, 8.0  # share of the excess closed at which "it explains it" is even, and how steeply that rises
 
 
 def explains(closed: float) -> float:
     """Probability that a cause that closes this share of the excess is not a stand-in for something unknown."""
-    middle, slope = EXPLAINS
-    return 1.0 / (1.0 + math.exp(-slope * (min(closed, 1.0) - middle)))
+    return 1.0 / (1.0 + math.exp(-STEEP * (min(closed, 1.0) - EVEN)))
 
 
 def nothing(p: float) -> float:

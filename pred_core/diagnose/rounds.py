@@ -10,7 +10,7 @@ import numpy as np
 from pred_core.diagnose.commission import with_values
 from pred_core.diagnose.evidence import Judged, lack_of_fit
 from pred_core.diagnose.fit import IN_FULL, counted
-from pred_core.diagnose.judge import QUICK, Bench, Effects, Screened, Tell, judge, quick, rng_of, scaled, screen
+from pred_core.diagnose.judge import QUICK, Bench, Effects, Screened, Tell, judge, quick, rng_of, scaled, screen, standing_of
 from pred_core.diagnose.naming import FEWEST, LEFT, STANDING, choose
 from pred_core.diagnose.pace import Pace
 from pred_core.diagnose.pairs import try_pairs
@@ -18,7 +18,7 @@ from pred_core.diagnose.places import Start
 from pred_core.diagnose.progress import Progress, Round
 from pred_core.diagnose.roll import on_ground
 from pred_core.diagnose.skill import POOR, WELL, skill_of
-from pred_core.diagnose.trial import NOT_A_NAME, make_trial
+from pred_core.diagnose.trial import NOT_A_NAME
 from pred_core.effects import LIBRARY
 from pred_core.types import Array
 
@@ -31,6 +31,7 @@ TOLD = 4  # candidates between two lines
 NOISE = 0.4  # loss of residuals that are noise: the mean of rho(u) for u ~ N(0, 1) is 0.36
 UNEXPLAINED = 1.2  # loss beyond which, without a reference, what is left is worth saying
 USUALLY = 3.0  # times the reference's loss: the same where there are too few episodes for a test
+SAME_AS_BASE = ("friction_scale", "bending_scale", "stretch_scale")  # of what is refitted without a reference
 CLOSE = 0.6  # share of the promise of its family's leader from which a candidate is kept beside it
 
 
@@ -50,13 +51,10 @@ def candidates(bench: Bench, named: Sequence[str]) -> list[Effects]:
             len(twin.body.bends) and twin.physics.bending_stiffness > 0.0
         ):
             continue
-        if cold and effect.id in _SAME_AS_BASE:
+        if cold and effect.id in SAME_AS_BASE:
             continue
         rows.append((effect,))
     return rows
-
-
-_SAME_AS_BASE = ("friction_scale", "bending_scale", "stretch_scale")
 
 
 def one_round(progress: Progress, tell: Tell, number: int) -> bool:
@@ -85,18 +83,15 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
         judged.append(judge(bench, s, progress.journal, f"{number}/fit/{s.trial.id}"))
         gain = f"gain {judged[-1].mean:.3f} of {base.mean():.3f}"
         tell(f"round {number + 1}: fitted {n + 1}/{len(finalists)}, {s.trial.id}: {gain}{pace.left(n + 1)}")
-    kept = finalists
     excess = float(base.mean()) - floor
     found, rows = choose(judged, excess, floor, progress)
     closed = found.closed if found else 0.0
     if (found is None or closed < config.enough) and not progress.late():
-        pair = try_pairs(progress, kept, judged, base, floor, tell, number)
+        pair = try_pairs(progress, finalists, judged, base, floor, tell, number)
         if pair is not None:
             found = pair
             rows = [*rows, (pair.judged, pair.p_adjusted, "")]
-    progress.rounds.append(
-        Round(base, floor, tuple((s.trial.id, s.promise) for s in screened), tuple(rows))
-    )
+    progress.rounds.append(Round(base, floor, tuple((s.trial.id, s.promise) for s in screened), tuple(rows)))
     if found is None:
         return False
     progress.add(found, extend(bench, found.judged))
@@ -113,11 +108,10 @@ def something_left(progress: Progress) -> bool:
     """Whether what is left is worth another look; before the first one it is."""
     if not progress.rounds:
         return True
-    first, base, floor = progress.rounds[0], progress.bench.standing(), _floor(progress.bench)
-    whole = float(first.base.mean()) - first.floor
+    base, floor = progress.bench.standing(), _floor(progress.bench)
     if progress.bench.reference is None:
         return float(base.mean()) > _counts(progress.bench, NOISE)
-    return float(base.mean()) - floor > max(progress.bench.config.gate * whole, STANDING * floor)
+    return float(base.mean()) - floor > max(progress.bench.config.gate * progress.whole(), STANDING * floor)
 
 
 def finish(progress: Progress) -> None:
@@ -168,8 +162,7 @@ def _floor(bench: Bench) -> float:
 
 def _reference_losses(bench: Bench) -> Array:
     assert bench.reference is not None
-    space = make_trial(bench.reference_twin, (), ()).space
-    return bench.reference.losses(space, [space.start()])[0]
+    return standing_of(bench.reference_twin, bench.reference)
 
 
 def _survivors(screened: list[Screened], count: int, least: float) -> list[Screened]:
@@ -202,5 +195,3 @@ def _halve(
     tell(f"round {number + 1}: ahead after {QUICK} steps: " + ", ".join(r[1].trial.id for r in rows[:4]))
     least = max(BEHIND * rows[0][0], worth)
     return [s for n, (saved, s) in enumerate(rows) if n < FEW or (n < FINALISTS and saved >= least)]
-
-

@@ -12,18 +12,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.stats import t as student
 
 from pred_core.diagnose.commission import base_fields, refined, values_of, with_stored
 from pred_core.diagnose.evidence import Judged, family_wise
 from pred_core.diagnose.fit import Target
 from pred_core.diagnose.journal import Journal
-from pred_core.diagnose.judge import JACKKNIFE, Bench, Tell
+from pred_core.diagnose.judge import TRUST, Bench, Tell, standing_of
 from pred_core.diagnose.pace import Pace
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.trial import Trial, make_trial
 from pred_core.effects import find_effect
 from pred_core.effects.effect import Effect
-from pred_core.identify.space import Candidate
 from pred_core.twin import Extension, Twin
 from pred_core.types import Array
 
@@ -77,11 +77,13 @@ def question(bench: Bench, journal: Journal, tell: Tell) -> tuple[Bench, Judged,
     before = bench.standing()
     best = _asked(bench, (), journal, "structure", tell)
     tell(f"bending by angle: gain {best.judged.mean:.3f} of {before.mean():.3f}")
-    least = bench.config.cold_gate * float(before.mean())
+    least, looks = bench.config.cold_gate * float(before.mean()), 1
     if best.judged.mean < least:
+        looks = 2
         best = _asked(bench, (COMPANION,), journal, "structure/damped", tell)
         tell(f"bending by angle, with damping: gain {best.judged.mean:.3f} of {before.mean():.3f}")
-    p = float(family_wise([best.judged], bench.config.seed)[0])
+    groups = bench.target.roller.sample.groups
+    p = min(1.0, looks * float(family_wise([best.judged], bench.config.seed, groups)[0]))
     if p > bench.config.level or best.judged.mean < least:
         return None
     twin = best.twin.replace(extensions=bench.twin.extensions)
@@ -131,12 +133,12 @@ def _asked(bench: Bench, beside: tuple[type[Effect], ...], journal: Journal, key
         return with_stored(slim, stored["twin"]), without
 
     twin, without = journal.piece(key, fit_chain, read)
-    base = _losses(bench.twin, target)
-    extended = _losses(twin, target)
+    base = standing_of(bench.twin, target)
+    extended = standing_of(twin, target)
     for group, other in without.items() if bench.config.cross_fit else ():
         mine = target.roller.sample.groups == group
         if mine.any():
-            extended[mine] = _losses(other, target)[mine]
+            extended[mine] = standing_of(other, target)[mine]
     trial = _trial(twin)
     knobs = trial.space.knobs
     value = twin.physics.bending_stiffness
@@ -158,7 +160,7 @@ def _width(spread: Sequence[float], value: float) -> float:
     """Half a 90 % interval of the value, by the jackknife over recordings as `judge.intervals` has it; of one recording
     nothing is known."""
     groups = len(spread)
-    return JACKKNIFE.get(groups, 1.8) * float(np.std(spread)) * (groups - 1) ** 0.5 if groups > 1 else value
+    return float(student.ppf(TRUST, groups - 1) * np.std(spread)) * (groups - 1) ** 0.5 if groups > 1 else value
 
 
 def _with(twin: Twin, effects: tuple[type[Effect], ...]) -> Twin:
@@ -180,19 +182,13 @@ def _first(slim: Twin, beside: tuple[type[Effect], ...], fitted: Target) -> Twin
     possible = [t for t in twins if Roller(t, fitted.roller.sample).usual() <= 3.0 * usual] or twins[:1]
     if beside:
         possible = [_damped(t, time) for t in possible for time in TIMES]
-    return min(possible, key=lambda t: float(_losses(t, fitted).mean()))
+    return min(possible, key=lambda t: float(standing_of(t, fitted).mean()))
 
 
 def _damped(twin: Twin, time: float) -> Twin:
     """The twin whose last extension, the damping, has this time [s]."""
     *others, last = twin.extensions
     return twin.replace(extensions=(*others, dataclasses.replace(last, parameters={"time": (time,)})))
-
-
-def _losses(twin: Twin, target: Target) -> Array:
-    """(E,) of a twin with the target's weights."""
-    u = Roller(twin, target.roller.sample).errors([Candidate(twin.physics, twin.extensions)], target.stride)
-    return target.losses_of(u * target.weights[..., None])[0]
 
 
 def _on(twin: Twin, target: Target) -> Target:
