@@ -22,6 +22,7 @@ from pred_core.diagnose.gate import GateCause, GateResult
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.progress import Named, Progress
 from pred_core.diagnose.ranking import UNSEEN, explains, nothing, ranking
+from pred_core.diagnose.refining import refining_said
 from pred_core.diagnose.result import Cause, Diagnosis, Value
 from pred_core.diagnose.said import called, confusions, sentence, unproven, without_interval
 from pred_core.effects import LIBRARY, find_effect
@@ -218,18 +219,20 @@ def test_all_causes_must_hold(twin: Twin, dragged: list[Episode]) -> None:
 def test_what_the_base_is_and_what_refining_changed(twin: Twin, dragged: list[Episode]) -> None:
     """The given twin has the drag and errs by noise alone; the base lost it. Where a replay takes long, words do."""
     given = twin.replace(extensions=drag())
-    bench: Any = SimpleNamespace(reference=object(), config=DiagnoseConfig(), twin=twin)
+    lost = twin.replace(extensions=drag(coefficient=0.0))
+    bench: Any = SimpleNamespace(reference=object(), config=DiagnoseConfig(), twin=lost)
     study = Study(tuple(dragged), tuple(dragged), (), given, gate_of(), bench, int(dragged[0].stamps[0]))
     test = [e for e in dragged if e.split == "test"]
-    errors = dataclasses.replace(answer(twin, dragged).errors, base=episode_errors(twin, test))
+    errors = dataclasses.replace(answer(twin, dragged).errors, base=episode_errors(lost, test))
     before, after = episode_errors(given, test).mean, errors.base.mean
     assert before < 0.5 * after
-    text = refining_of(study, errors, 0.1)
+    text = refining_said(refining_of(study, errors, 0.1), "test")
     assert text.startswith("base: your twin refined on the reference, not as it was given")
-    assert text.endswith(f": on the test episodes {before:.1f} mm as given, {after:.1f} mm refined")
-    assert refining_of(study, errors, 2.0 * CHEAP) == text.split(":")[0] + ":" + text.split(":")[1]
+    moved = "(drag linear.coefficient 1.5 to 0 1/s)"
+    assert text.endswith(f": on the test episodes {before:.1f} mm as given, {after:.1f} mm refined {moved}")
+    assert refining_said(refining_of(study, errors, 2.0 * CHEAP), "test") == f"{text[: text.index(': on')]} {moved}"
     bench.reference = None
-    assert "refined on the train episodes" in refining_of(study, errors, 2.0 * CHEAP)
+    assert "refined on the train episodes" in refining_said(refining_of(study, errors, 2.0 * CHEAP), "test")
 
 
 def delay_of(closed: float | None) -> Cause:

@@ -19,13 +19,14 @@ from pred_core.diagnose.naming import exploratory, one_recording
 from pred_core.diagnose.next_motion import propose
 from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.ranking import EVEN, ranking
+from pred_core.diagnose.refining import Refined, moved, refining_said
 from pred_core.diagnose.result import Cause, Diagnosis, Errors
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.said import not_identifiable, sentence, unproven, without_interval
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
-CHEAP = 2.0  # [s] that replaying the given twin may take, for what refining changed
+CHEAP = 10.0  # [s] that replaying the given twin may take, for what refining changed
 PARTLY = 0.3  # share of the excess from which what was measured is the answer although something is left
 
 
@@ -69,7 +70,7 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         not_testable=not_testable_in(study.gate, progress),
         next_motion=None,
         exploratory=exploratory(study.bench),
-        notes=_notes(study, progress, causes, errors, ood, refining),
+        notes=_notes(study, progress, causes, errors, ood, refining_said(refining, split)),
         gate=study.gate,
         rounds=tuple(progress.rounds),
         base_twin=study.bench.twin,
@@ -80,6 +81,7 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         more=progress.unknown or progress.left,
         explained=progress.explained,
         settings=to_mapping(config),
+        refined=refining,
     )
     result = dataclasses.replace(result, next_motion=propose(result, study.corrected, config.seed))
     return dataclasses.replace(result, sentence=sentence(result), seconds=time.monotonic() - begin)
@@ -188,15 +190,12 @@ def closed_by_gate(gate: GateResult, named: Mapping[str, float], errors: Errors)
     }
 
 
-def refining_of(study: Study, errors: Errors, took: float) -> str:
+def refining_of(study: Study, errors: Errors, took: float) -> Refined:
     """What the base is, and by how much it differs from the given twin. `took` [s] of replaying the episodes once."""
     source = "the train episodes" if study.bench.reference is None else "the reference"
-    text = f"base: your twin refined on {source}, not as it was given"
-    if took > CHEAP:
-        return text
     given = study.given.replace(calibration=Calibration(), residual=None)
-    before = episode_errors(given, _before(study, errors.split), study.session).mean
-    return f"{text}: on the {errors.split} episodes {before:.1f} mm as given, {errors.base.mean:.1f} mm refined"
+    before = None if took > CHEAP else episode_errors(given, _before(study, errors.split), study.session).mean
+    return Refined(source, before, errors.base.mean, moved(given, study.bench.twin))
 
 
 def not_testable_in(gate: GateResult, progress: Progress) -> Mapping[str, str]:

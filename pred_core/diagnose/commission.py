@@ -13,25 +13,30 @@ from torch import Tensor
 from pred_core.config import from_mapping
 from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.diagnose.effort import say_effort
-from pred_core.diagnose.fit import Target, fit
+from pred_core.diagnose.fit import Fit, Target, fit, rho
 from pred_core.diagnose.journal import Journal, vector
 from pred_core.diagnose.judge import Bench, Tell, scaled
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.sample import Sample, make_sample
-from pred_core.diagnose.trial import make_trial
+from pred_core.diagnose.trial import Trial, make_trial
 from pred_core.diagnose.weigh import Weights, misfit_of, seen_of, weigh
 from pred_core.effects import effect_of, find_effect
 from pred_core.effects.effect import Effect
 from pred_core.errors import ConfigError, DatasetError
-from pred_core.identify.space import Candidate
+from pred_core.identify.space import Candidate, Knob
 from pred_core.twin import Extension, Twin
-from pred_core.types import Episode, Physics
+from pred_core.types import Array, Episode, Physics
 
 BASE = ("stiffness", "ground_friction", "bending_stiffness")  # refined; axial damping does not show
 ROOM = 2.0  # times the substeps of the given twin that the refined one may need: identified for speed, it may stretch
 WORST = 0.25  # [m] mean error of a twin that is not this object's
 OWN_MISFIT = 0.02  # of the variance a base leaves that weights allow for without a reference
 POLISH = 8  # steps of the base's refinement
+TIMES = tuple(float(f) for f in np.geomspace(0.1, 10.0, 17))  # what each of its numbers is multiplied by first
+FEW = 16  # windows in which they are tried
+VALLEY = 0.8  # of the loss: what a refinement from the best of them must come to, to take the place of one from the base
+SLOWER = 0.5  # of the loss that the base has: below it a point may need up to twice the substeps that ROOM allows
+TURNS = 0.97  # of the loss, to which another value must bring it to be taken: what does not act stays as it is
 
 
 def base_fields(twin: Twin) -> tuple[str, ...]:
@@ -131,22 +136,62 @@ def with_stored(twin: Twin, values: dict[str, Any]) -> Twin:
 
 def _polish(twin: Twin, sample: Sample, use: NDArray[np.bool_], config: DiagnoseConfig, tell: Tell) -> Twin:
     """The base and what it already carries, refined on the sample with the loss the candidates are judged by."""
-    chosen = use
     most = ROOM * Roller(twin, sample).usual()
-    for _ in range(2):  # the weights follow the parameters
+    for attempt in range(2):  # the weights follow the parameters
         roller = Roller(twin, sample)
         weights = _weigh(roller, Candidate(twin.physics, twin.extensions), config, None)
         target = Target(roller, weights, config.stride)
         standing = tuple(find_effect(e.id) for e in twin.extensions)
         narrow = tuple(e for e in standing if sum(q.size for q in e.parameters) <= 4)
         trial = make_trial(twin, narrow, base_fields(twin))
-        before = target.losses(trial.space, [trial.space.start()])[0]
-        result = fit(target, trial.space, trial.space.start(), POLISH, chosen, most / roller.usual())
-        tell(f"base: loss {before[chosen].mean():.3f} -> {result.loss[chosen].mean():.3f}")
+        start = trial.space.start()
+        before = target.losses(trial.space, [start])[0]
+        result = fit(target, trial.space, start, POLISH, use, most / roller.usual())
+        other = None if attempt else _elsewhere(target, trial, result.z, use, most)
+        if other is not None and other.loss[use].mean() < VALLEY * result.loss[use].mean():
+            result = other
+        tell(f"base: loss {before[use].mean():.3f} -> {result.loss[use].mean():.3f}")
         twin = with_values(twin, trial.space.candidate(result.z))
-        if result.loss[chosen].mean() > 0.97 * before[chosen].mean():
+        if result.loss[use].mean() > TURNS * before[use].mean():
             break
     return twin
+
+
+def _elsewhere(target: Target, trial: Trial, refined: Array, use: NDArray[np.bool_], most: float) -> Fit | None:
+    """A refinement from another point than the base; None if no point is better than `refined`.
+
+    Each number of the twin is multiplied by TIMES in turn, as far as `most` substeps a period allow: the loss along a
+    stiffness that is three times too large has valleys of its own.
+    """
+    space, sample = trial.space, target.roller.sample
+    windows = np.flatnonzero(use[sample.episode])
+    few = target.some(windows[np.linspace(0, len(windows) - 1, min(FEW, len(windows))).astype(np.int64)])
+
+    def losses(points: Sequence[Array]) -> Array:
+        return few.per_window(rho(few.residuals(space, points))).mean(axis=1)
+
+    best = space.start()
+    standing, aim = losses([best, refined])
+    least = standing
+    for n, knob in [(n, k) for _ in range(2) for n, k in enumerate(space.knobs) if "." not in k.name]:
+        points = [_with_one(best, n, knob, factor * knob.value(0.0)) for factor in TIMES]
+        needed = np.array([target.roller.demand(space.candidate(z)) for z in points])
+        for bound, fast in ((np.inf, needed <= most), (SLOWER * standing, (most < needed) & (needed <= 2.0 * most))):
+            possible = [z for z, ok in zip(points, fast, strict=True) if ok]
+            tried = losses(possible) if possible else np.array([np.inf])
+            if tried.min() < min(TURNS * least, bound):
+                best, least = possible[int(tried.argmin())], float(tried.min())
+    if least >= aim:
+        return None
+    room = most / max(target.roller.usual(), target.roller.demand(space.candidate(best)))
+    return fit(target, space, best, POLISH, use, max(room, 1.0))
+
+
+def _with_one(z: Array, n: int, knob: Knob, value: float) -> Array:
+    """`z` with another value of one knob, within its bounds."""
+    other = z.copy()
+    other[n] = knob.coordinate(float(np.clip(value, knob.low, knob.high)))
+    return other
 
 
 def refined(

@@ -9,6 +9,7 @@ from typing import Any
 from pred_core.diagnose.errors import EpisodeErrors, Gain
 from pred_core.diagnose.gate import GateResult
 from pred_core.diagnose.progress import Round
+from pred_core.diagnose.refining import Refined
 from pred_core.twin import Twin
 
 OUTCOMES = ("none", "named", "group", "unknown")
@@ -93,6 +94,7 @@ class Diagnosis:
     more: bool = False  # beside what was named something is left that no candidate explains
     explained: float | None = None  # share of the motion in windows of held-out episodes; None: it hardly moves
     settings: Mapping[str, Any] = field(default_factory=dict)  # of the run
+    refined: Refined | None = None
 
     @property
     def p_adjusted(self) -> float:
@@ -136,6 +138,7 @@ class Diagnosis:
             "not_testable": dict(self.not_testable),
             "next_motion": None if self.next_motion is None else dict(self.next_motion),
             "notes": list(self.notes),
+            "base": None if self.refined is None else self.refined.to_json(),
             "gate": self.gate.to_json(),
             "seconds": self.seconds,
             "seed": self.seed,

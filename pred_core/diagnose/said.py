@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pred_core.diagnose.refining import moved_in_words
 from pred_core.diagnose.skill import POOR
 from pred_core.effects import LIBRARY, confounded
 from pred_core.types import Episode
@@ -61,7 +62,17 @@ def called(cause: Cause) -> str:
 
 
 def sentence(d: Diagnosis) -> str:
-    """The sentence a report opens with."""
+    """The sentence a report opens with; a second one where the twin's own numbers were what was off most."""
+    if d.refined is None or not d.refined.off:
+        return _sentence(d)
+    r, held = d.refined, "held-out" if d.errors.split == "test" else "fitted"
+    return (
+        f"{_sentence(d)} That is beside your twin's own numbers, which were off: {moved_in_words(r)}; refined on {r.on} "
+        f"they take the {held} error from {r.given:.1f} to {r.base:.1f} mm."
+    )
+
+
+def _sentence(d: Diagnosis) -> str:
     e = d.errors
     held = "held-out error" if e.split == "test" else "error on the episodes it was fitted to"
     count = f"{e.gain.improved} of {e.gain.episodes} episodes"
