@@ -13,7 +13,16 @@ from diagnose_cases import bench_of, quiet
 from report_cases import LINEAR, answer, drag, judged, recorded, rope, with_errors
 
 from pred_core.calibration import Calibration
-from pred_core.diagnose.answer import CHEAP, Study, closed_by_gate, explained_by, floor_of, outcome_of, refining_of
+from pred_core.diagnose.answer import (
+    CHEAP,
+    Study,
+    closed_by_gate,
+    explained_by,
+    floor_of,
+    outcome_of,
+    refining_of,
+    seen_only,
+)
 from pred_core.diagnose.answer import answer as answer_of
 from pred_core.diagnose.causes import causes_of, evidence_of
 from pred_core.diagnose.config import DiagnoseConfig
@@ -266,6 +275,22 @@ def test_what_was_measured_counts_as_explained(causes: tuple[Cause, ...], cold: 
     progress.bench.reference = None if cold else object()
     assert outcome_of(causes, progress) == outcome
     assert 0.0 <= explained_by(causes) <= 1.0
+
+
+def test_what_only_the_gate_saw_is_not_nothing(twin: Twin, dragged: list[Episode]) -> None:
+    """Slip of 35 mm in the tracks that no candidate explains: the answer says so, and is not "nothing"."""
+    gate = gate_of(measured("grip_slip", 35.0), measured("delay"))
+    seen = seen_only(gate, (delay_of(0.5),))
+    assert seen == {"grip_slip": 35.0}
+    assert outcome_of((), progress_of((0, 1)), tuple(seen)) == "unknown"
+    assert outcome_of((), progress_of((0, 1)), ("table_height",)) == "none", "cold"
+    assert outcome_of((), progress_of((0, 1))) == "none"
+    d = dataclasses.replace(answer(twin, dragged), causes=(), outcome="unknown", seen=seen)
+    assert "Seen in the tracks, and explained by no candidate: slip in the gripper, 35.0 mm" in sentence(d)
+    slip = Cause("grip_slip", "slip", 0.9, {}, False, 0.9)
+    assert not seen_only(gate, (slip,))
+    table = Cause("table_height", "table", 0.9, {}, False, 0.9)
+    assert not seen_only(gate_of(measured("table_relief"), measured("table_tilt")), (table,))
 
 
 def test_a_number_that_was_measured_is_said_whatever_is_left(twin: Twin, dragged: list[Episode]) -> None:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pred_core.calibration import Calibration
 from pred_core.config import to_mapping
-from pred_core.diagnose.causes import causes_of, evidence_of
+from pred_core.diagnose.causes import causes_of, evidence_of, family_of
 from pred_core.diagnose.errors import EpisodeErrors, episode_errors, gain_of
+from pred_core.diagnose.evidence import FEWEST_ACTING
 from pred_core.diagnose.gate import GateResult
+from pred_core.diagnose.gate_table_causes import PLANE_CAUSES
 from pred_core.diagnose.judge import Bench, Tell
 from pred_core.diagnose.naming import exploratory, one_recording
 from pred_core.diagnose.next_motion import propose
@@ -23,6 +25,7 @@ from pred_core.diagnose.refining import Refined, moved, refining_said
 from pred_core.diagnose.result import Cause, Diagnosis, Errors
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.said import not_identifiable, sentence, unproven, without_interval
+from pred_core.effects import LIBRARY
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
@@ -57,7 +60,8 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         study.gate, progress, {r.id: r.probability for r in ranked}, closed_by_gate(study.gate, budget["named"], errors)
     )
     ood = _errors(study, progress, "ood") if any(e.split == "ood" for e in study.corrected) else None
-    outcome = outcome_of(causes, progress)
+    seen = seen_only(study.gate, causes)
+    outcome = outcome_of(causes, progress, tuple(seen))
     result = Diagnosis(
         outcome=outcome,
         sentence="",
@@ -82,15 +86,27 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         explained=progress.explained,
         settings=to_mapping(config),
         refined=refining,
+        seen=seen,
     )
     result = dataclasses.replace(result, next_motion=propose(result, study.corrected, config.seed))
     return dataclasses.replace(result, sentence=sentence(result), seconds=time.monotonic() - begin)
 
 
-def outcome_of(causes: Sequence[Cause], progress: Progress) -> str:
+def seen_only(gate: GateResult, causes: Sequence[Cause]) -> dict[str, float]:
+    """What the gate found that is physics, and that no candidate explains -> its size [mm] at the object."""
+    families = {c.family for c in causes}
+    return {
+        c.id: c.effect_mm
+        for c in gate.accepted
+        if c.id not in gate.sensor_ids and (family_of(c.id) if c.id in LIBRARY else "table") not in families
+    }
+
+
+def outcome_of(causes: Sequence[Cause], progress: Progress, seen: Collection[str] = ()) -> str:
     """One of OUTCOMES, from what was found and whether something is left: with too little explained it is unknown.
 
     A law that was fitted must then be the answer more probably than not; what the gate measured is there by itself.
+    `seen`: physics that the gate found and no candidate explains; where a table lies is known from a reference only.
     """
     physics = [c for c in causes if not c.measured]
     cold = progress.bench.reference is None  # nobody knows there how much there is to explain
@@ -100,7 +116,7 @@ def outcome_of(causes: Sequence[Cause], progress: Progress) -> str:
     if progress.unknown and explained_by(causes) < least:
         return "unknown"
     if not causes:
-        return "none"
+        return "unknown" if [s for s in seen if not (cold and s in PLANE_CAUSES)] else "none"
     return "group" if any(c.group for c in causes) else "named"
 
 
@@ -201,11 +217,13 @@ def refining_of(study: Study, errors: Errors, took: float) -> Refined:
 def not_testable_in(gate: GateResult, progress: Progress) -> Mapping[str, str]:
     """Candidate -> why these data cannot show it. One that they would show, and that is not there, is none of them."""
     rows = {c.id: c.why for c in gate.causes if not c.testable}
-    found = [n.judged.trial.id for n in progress.named]
-    for judged, _, why in (row for r in progress.rounds for row in r.judged):
-        if why and not judged.testable and judged.trial.id not in found:
-            size = f"{judged.excited or 0} of {len(judged.acts)} episodes"
-            rows[judged.trial.id] = f"these motions hardly excite it: a typical change of it moves {size}"
+    found = [i for n in progress.named for i in n.judged.trial.ids]
+    hardly = "these motions hardly excite it: a typical change of it moves {} of {} episodes"
+    for r in progress.rounds:
+        idle = {j.trial.id: j.excited or 0 for j, _, why in r.judged if why and not j.testable}
+        idle |= {id: n for id, n in r.excited.items() if n < min(FEWEST_ACTING, len(r.base))}
+        rows |= {id: hardly.format(n, len(r.base)) for id, n in idle.items() if id not in found}
+        rows |= {id: why for id, why in r.passed.items() if id not in found}
     return rows
 
 

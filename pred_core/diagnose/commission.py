@@ -33,8 +33,8 @@ WORST = 0.25  # [m] mean error of a twin that is not this object's
 OWN_MISFIT = 0.02  # of the variance a base leaves that weights allow for without a reference
 POLISH = 8  # steps of the base's refinement
 TIMES = tuple(float(f) for f in np.geomspace(0.1, 10.0, 17))  # what each of its numbers is multiplied by first
-FEW = 16  # windows in which they are tried
-VALLEY = 0.8  # of the loss: what a refinement from the best of them must come to, to take the place of one from the base
+FEW, SWEEPS = 16, 4  # windows in which they are tried; how often, as long as it helps
+VALLEY = 0.8  # of the loss to which the base was refined: what another start must come to, to take its place
 SLOWER = 0.5  # of the loss that the base has: below it a point may need up to twice the substeps that ROOM allows
 TURNS = 0.97  # of the loss, to which another value must bring it to be taken: what does not act stays as it is
 
@@ -173,14 +173,20 @@ def _elsewhere(target: Target, trial: Trial, refined: Array, use: NDArray[np.boo
     best = space.start()
     standing, aim = losses([best, refined])
     least = standing
-    for n, knob in [(n, k) for _ in range(2) for n, k in enumerate(space.knobs) if "." not in k.name]:
-        points = [_with_one(best, n, knob, factor * knob.value(0.0)) for factor in TIMES]
-        needed = np.array([target.roller.demand(space.candidate(z)) for z in points])
-        for bound, fast in ((np.inf, needed <= most), (SLOWER * standing, (most < needed) & (needed <= 2.0 * most))):
-            possible = [z for z, ok in zip(points, fast, strict=True) if ok]
-            tried = losses(possible) if possible else np.array([np.inf])
-            if tried.min() < min(TURNS * least, bound):
-                best, least = possible[int(tried.argmin())], float(tried.min())
+    numbers = [(n, k) for n, k in enumerate(space.knobs) if "." not in k.name]
+    for _ in range(SWEEPS):
+        before = least
+        for n, knob in numbers:
+            points = [_with_one(best, n, knob, factor * knob.value(float(best[n]))) for factor in TIMES]
+            needed = np.array([target.roller.demand(space.candidate(z)) for z in points])
+            slow = (most < needed) & (needed <= 2.0 * most)
+            for bound, fits in ((np.inf, needed <= most), (SLOWER * standing, slow)):
+                possible = [z for z, ok in zip(points, fits, strict=True) if ok]
+                tried = losses(possible) if possible else np.array([np.inf])
+                if tried.min() < min(TURNS * least, bound):
+                    best, least = possible[int(tried.argmin())], float(tried.min())
+        if least > TURNS * before:
+            break
     if least >= aim:
         return None
     room = most / max(target.roller.usual(), target.roller.demand(space.candidate(best)))

@@ -90,6 +90,8 @@ def why_not(j: Judged, p: float, excess: float, floor: float, progress: Progress
             return _idle(j)
         if j.worse:
             return f"{j.worse} of {acting} episodes get worse"
+        if whole <= 0.0:
+            return "there is no more error than in the reference"
         return "" if j.mean >= max(EXPLORATORY * whole, least) else f"saves too little ({j.mean:.3f} of the loss)"
     if acting < FEWEST_ACTING:
         return _idle(j)

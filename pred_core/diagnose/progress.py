@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from pred_core.diagnose.evidence import Judged
@@ -36,6 +37,8 @@ class Round:
     floor: float  # mean loss of the reference, or nothing
     screened: tuple[tuple[str, float], ...]  # candidate, promise
     judged: tuple[tuple[Judged, float, str], ...]  # candidate, adjusted p, why it was rejected ("" = accepted)
+    excited: Mapping[str, int] = field(default_factory=dict)  # candidate that was not judged -> episodes it would move
+    passed: Mapping[str, str] = field(default_factory=dict)  # candidate that cannot act here -> why
 
 
 @dataclass

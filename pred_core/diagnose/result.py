@@ -95,6 +95,7 @@ class Diagnosis:
     explained: float | None = None  # share of the motion in windows of held-out episodes; None: it hardly moves
     settings: Mapping[str, Any] = field(default_factory=dict)  # of the run
     refined: Refined | None = None
+    seen: Mapping[str, float] = field(default_factory=dict)  # physics that only the gate found -> its size [mm]
 
     @property
     def p_adjusted(self) -> float:

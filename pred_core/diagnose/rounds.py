@@ -8,9 +8,23 @@ from collections.abc import Sequence
 import numpy as np
 
 from pred_core.diagnose.commission import with_values
-from pred_core.diagnose.evidence import Judged, lack_of_fit
+from pred_core.diagnose.evidence import ACTS, Judged, lack_of_fit
 from pred_core.diagnose.fit import IN_FULL, counted
-from pred_core.diagnose.judge import QUICK, Bench, Effects, Screened, Tell, judge, quick, rng_of, scaled, screen, standing_of
+from pred_core.diagnose.journal import Journal
+from pred_core.diagnose.judge import (
+    QUICK,
+    Bench,
+    Effects,
+    Screened,
+    Tell,
+    excitation,
+    judge,
+    quick,
+    rng_of,
+    scaled,
+    screen,
+    standing_of,
+)
 from pred_core.diagnose.naming import FEWEST, LEFT, STANDING, choose
 from pred_core.diagnose.pace import Pace
 from pred_core.diagnose.pairs import try_pairs
@@ -18,8 +32,10 @@ from pred_core.diagnose.places import Start
 from pred_core.diagnose.progress import Progress, Round
 from pred_core.diagnose.roll import on_ground
 from pred_core.diagnose.skill import POOR, WELL, skill_of
-from pred_core.diagnose.trial import NOT_A_NAME
+from pred_core.diagnose.trial import NOT_A_NAME, scanned
 from pred_core.effects import LIBRARY
+from pred_core.effects.effect import Effect
+from pred_core.twin import Twin
 from pred_core.types import Array
 
 GATE_ONLY = ("gripper_offset", "gripper_rotation")  # absorbed by measured starts: the model-free gate names them
@@ -35,26 +51,50 @@ SAME_AS_BASE = ("friction_scale", "bending_scale", "stretch_scale")  # of what i
 CLOSE = 0.6  # share of the promise of its family's leader from which a candidate is kept beside it
 
 
-def candidates(bench: Bench, named: Sequence[str]) -> list[Effects]:
-    """Effects worth trying on this bench: those that can act and are not named yet."""
-    twin = bench.twin
+def candidates(bench: Bench, named: Sequence[str]) -> tuple[list[Effects], dict[str, str]]:
+    """Effects worth trying on this bench, those that can act and are not named yet; candidate -> why it cannot."""
     cold = bench.reference is None
     rows: list[Effects] = []
+    passed = {"gripper_rotation": "starts are measured: what a turned gripper frame does to them is taken in"}
     for effect in LIBRARY.values():
         if set(effect.hooks) == {"observe"} or effect.id in GATE_ONLY or effect.id in named:
             continue
         if effect.id in NOT_A_NAME and not (cold and effect.id == "rest_curvature"):
             continue
-        if "contact" in effect.hooks and twin.scene.ground is None:
-            continue
-        if {"bend", "bend_stiffness"} & set(effect.hooks) and not (
-            len(twin.body.bends) and twin.physics.bending_stiffness > 0.0
-        ):
-            continue
-        if cold and effect.id in SAME_AS_BASE:
-            continue
-        rows.append((effect,))
-    return rows
+        why = _cannot_act(effect, bench.twin)
+        if not why and cold and effect.id in SAME_AS_BASE:
+            why = "a number of the twin itself, which is refined first where there is no reference"
+        if why:
+            passed[effect.id] = why
+        else:
+            rows.append((effect,))
+    return rows, passed
+
+
+def _cannot_act(effect: type[Effect], twin: Twin) -> str:
+    """Why an effect does nothing in this twin, whatever its size; "" if it may."""
+    if "contact" in effect.hooks and twin.scene.ground is None:
+        return "the twin's scene has no table"
+    bends = len(twin.body.bends) and twin.physics.bending_stiffness > 0.0
+    return "" if bends or not {"bend", "bend_stiffness"} & set(effect.hooks) else "the twin does not bend by angles"
+
+
+def excited(bench: Bench, screened: Sequence[Screened], journal: Journal) -> dict[str, int]:
+    """Candidate -> episodes that a typical change of it would move; not those that act in a place, wherever that is,
+    except on a table that nothing touches."""
+
+    def find() -> dict[str, int]:
+        found = {}
+        touched = int(on_ground(bench.target.roller).sum())
+        for s in screened:
+            off = s.trial.space.start()
+            if not any(scanned(e) for e in s.effects):
+                found[s.trial.id] = int((excitation(bench.target, s.trial, off, off) > ACTS).sum())
+            elif any("contact" in e.hooks for e in s.effects) and not touched:
+                found[s.trial.id] = 0
+        return found
+
+    return journal.piece("0/excited", find, lambda v: {str(k): int(n) for k, n in v.items()})
 
 
 def one_round(progress: Progress, tell: Tell, number: int) -> bool:
@@ -63,7 +103,7 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
     base, floor = bench.standing(), _floor(bench)
     progress.well = explains_well(bench)
     named = [i for n in progress.named for i in n.judged.trial.ids]
-    options = candidates(bench, named)
+    options, passed = candidates(bench, named)
     screened = []
     pace = Pace(len(options), progress.journal)
     for n, effects in enumerate(options):
@@ -91,7 +131,10 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
         if pair is not None:
             found = pair
             rows = [*rows, (pair.judged, pair.p_adjusted, "")]
-    progress.rounds.append(Round(base, floor, tuple((s.trial.id, s.promise) for s in screened), tuple(rows)))
+    rest = [s for s in screened if s.trial.id not in {f.trial.id for f in finalists}] if number == 0 else []
+    acting = excited(bench, rest, progress.journal) if rest else {}
+    screens = tuple((s.trial.id, s.promise) for s in screened)
+    progress.rounds.append(Round(base, floor, screens, tuple(rows), acting, passed))
     if found is None:
         return False
     progress.add(found, extend(bench, found.judged))

@@ -62,12 +62,17 @@ def called(cause: Cause) -> str:
 
 
 def sentence(d: Diagnosis) -> str:
-    """The sentence a report opens with; a second one where the twin's own numbers were what was off most."""
+    """The sentence a report opens with; others where the gate saw physics that no candidate explains, and where the
+    twin's own numbers were off."""
+    text = _sentence(d)
+    if d.seen:
+        found = "; ".join(f"{NAMES.get(id, id)}, {size:.1f} mm at the object" for id, size in d.seen.items())
+        text += f" Seen in the tracks, and explained by no candidate: {found}."
     if d.refined is None or not d.refined.off:
-        return _sentence(d)
+        return text
     r, held = d.refined, "held-out" if d.errors.split == "test" else "fitted"
     return (
-        f"{_sentence(d)} That is beside your twin's own numbers, which were off: {moved_in_words(r)}; refined on {r.on} "
+        f"{text} That is beside your twin's own numbers, which were off: {moved_in_words(r)}; refined on {r.on} "
         f"they take the {held} error from {r.given:.1f} to {r.base:.1f} mm."
     )
 

@@ -25,7 +25,6 @@ from pred_core.diagnose.trial import Trial, make_trial
 from pred_core.effects import find_effect
 from pred_core.effects.effect import Effect
 from pred_core.twin import Extension, Twin
-from pred_core.types import Array
 
 ID = "bending_by_angle"
 FAMILY = "bending"
