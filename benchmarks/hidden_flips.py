@@ -35,7 +35,7 @@ def flips(cases: Sequence[tuple[Path, Path]]) -> list[str]:
         raise ConfigError("journals of controls", got=got, next_step="Run the cases first, and keep journal.jsonl")
     low = ", ".join(f"{p:.3f}" for p in sorted(smallest)[:5])
     return [
-        f"{len(smallest)} controls, smallest p values by sign flips of episodes: {low}",
+        f"{len(smallest)} controls, smallest p values by sign flips (recordings, or episodes of fewer than ten): {low}",
         f"intraclass correlation of gains in a recording: mean {np.mean(alike):.2f}, median {np.median(alike):.2f}, "
         f"{len(alike)} fits",
     ]

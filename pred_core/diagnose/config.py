@@ -15,7 +15,7 @@ class DiagnoseConfig:
 
     window: float = setting(1.6, unit="s", low=0.1, high=60.0, doc="length of a rollout between two starts from data")
     stride: int = setting(2, low=1, high=50, doc="frames between the residuals that are read")
-    level: float = setting(0.05, low=1e-4, high=0.5, doc="family-wise error of a name")
+    level: float = setting(0.05, low=1e-4, high=0.5, doc="family-wise error of a name, over what one round fitted")
     gate: float = setting(0.1, low=0.0, high=1.0, doc="least share of the excess error that a cause must close")
     cold_gate: float = setting(
         0.25, low=0.0, high=1.0, doc="the same where there is no reference and the twin explains 94 % of the motion"

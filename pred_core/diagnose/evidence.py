@@ -1,4 +1,4 @@
-"""What held-out episodes say of each candidate: gains, family-wise significance, who else explains it."""
+"""What episodes say of each candidate by parameters of other recordings: gains, their p values, who else explains it."""
 
 from __future__ import annotations
 

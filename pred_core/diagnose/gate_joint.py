@@ -181,9 +181,11 @@ class Joint:
             if not episodes:
                 continue
             point, m = self._point(suspect), self._map(suspect)
-            self.noise = typical_noise(episodes, self.ids, point, self.center)
+            noise = typical_noise(episodes, self.ids, point, self.center)
+            if suspect:
+                self.noise = noise  # [m] of the suspect episodes
             for tracks in episodes:
-                own = normal_equations(tracks, self.ids, point, self.center, self.noise, self.slide_axis)
+                own = normal_equations(tracks, self.ids, point, self.center, noise, self.slide_axis)
                 self._normals.append(own)
                 self._maps.append(m)
                 self._parts.append(Normal(m.T @ own.matrix @ m, m.T @ own.gradient, own.misfit, own.count))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import hashlib
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +17,8 @@ from pred_core.diagnose.config import DiagnoseConfig
 from pred_core.errors import DatasetError, TwinError
 from pred_core.twin import Twin
 
-VERSION = 4  # of the journal's pieces
+VERSION = 5  # of the journal's pieces
+CODE = ("diagnose", "effects", "springmass", "identify", "train")  # what an answer comes from
 GRAVITY_APART = 0.01 * 9.81  # [m/s^2] declared gravities may differ by, as vectors: 0.6 degrees of tilt
 SHOWN = 5  # bags in a line
 _FALLBACK = "what it was asked cannot be read"
@@ -36,7 +39,17 @@ def job_of(dataset: Dataset, reference: Dataset | None, twin: Twin, config: Diag
     facts = [repr((s.entries, s.held, s.gravity, s.known, s.sigma)) for s in sets]
     plain = dataclasses.replace(config, seconds=DiagnoseConfig().seconds)
     asked = {"twin": twin.digest(), "levers": repr(twin.meta.levers), "config": repr(plain), "version": VERSION}
+    asked["code"] = code_digest()
     return {"data": hashes, "facts": facts, **asked}
+
+
+@functools.cache
+def code_digest() -> str:
+    """Of the sources an answer comes from: pieces of two versions are not one answer."""
+    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    for path in sorted(p for name in CODE for p in (root / name).rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def check_gravity(dataset: Dataset, reference: Dataset | None, twin: Twin, path: Path) -> None:
@@ -84,7 +97,7 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
         found.append("another twin")
     old, new = (dict(re.findall(r"(\w+)=([^,()]+)", str(h["config"]))) for h in (before, now))
     found += [f"{k} {old.get(k, 'unknown')}, now {v}" for k, v in new.items() if old.get(k) != v]
-    if before["version"] != now["version"]:
+    if (before["version"], before["code"]) != (now["version"], now["code"]):
         found.append("written by another version")
     return found
 

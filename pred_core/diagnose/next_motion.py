@@ -26,6 +26,7 @@ from pred_core.diagnose.standing_start import SETTLE, Start, starts_of
 from pred_core.twin import Twin
 from pred_core.types import Array, Episode, Grip
 
+TELLS = 3.0  # standard deviations that two rivals must be apart in a motion, for it to be proposed
 NEAR = 0.02  # probability of a runner-up from which it is a rival
 WIDE = 1.0  # width of a 90 % interval over the value from which a single cause's strength is in question
 NORMAL = 1.645  # standard deviations of half a 90 % interval
@@ -115,12 +116,14 @@ class Tried:
 def choose(
     twin: Twin, pair: tuple[Rival, Rival], episodes: Sequence[Episode], sigma: float, seed: int
 ) -> dict[str, Any] | None:
-    """The best motion of the library for two rivals, as plain values; None: there is no room to move.
+    """The best motion of the library for two rivals, as plain values; None: no room to move, or no motion tells.
 
     `sigma` [m] noise of the tracks.
     """
     tried = compare(twin, pair, episodes, sigma, seed)
-    return None if tried is None else _told(twin, pair, tried)
+    if tried is None or tried.separation.squared.max() < TELLS**2:
+        return None
+    return _told(twin, pair, tried)
 
 
 def compare(

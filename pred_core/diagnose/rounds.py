@@ -38,7 +38,7 @@ from pred_core.effects.effect import Effect
 from pred_core.twin import Twin
 from pred_core.types import Array
 
-GATE_ONLY = ("gripper_offset", "gripper_rotation")  # absorbed by measured starts: the model-free gate names them
+GATE_ONLY = ("gripper_offset", "gripper_rotation")  # taken in by measured starts; the gate names the first
 WORTH = 0.03  # of the floor: what a candidate must promise to be fitted to the end
 SURE = 0.02  # p value of a lack of fit
 FEW, FINALISTS = 2, 5  # candidates that are fitted to the end: at least, and at most

@@ -10,7 +10,8 @@ from pred_core.effects.effect import Effect, Parameter
 from pred_core.identify.space import SearchSpace, search_space
 from pred_core.twin import Twin
 
-# Effects that are measurement (corrected, not simulated) or too flexible to be a name: they would explain anything.
+# Effects too flexible to be a name, they would explain anything, and the forms with a free power that laws are held
+# against (`form.py`).
 NOT_A_NAME = ("bending_profile", "mass_profile", "rest_curvature", "drag_power", "friction_power")
 
 
