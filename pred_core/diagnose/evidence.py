@@ -1,4 +1,4 @@
-"""What episodes say of each candidate by parameters of other recordings: gains, their p values, who else explains it."""
+"""What episodes say of each candidate by parameters of other recordings: gains, p values, who else explains it."""
 
 from __future__ import annotations
 
