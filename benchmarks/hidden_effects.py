@@ -114,6 +114,12 @@ def run_cases(args: argparse.Namespace) -> int:
     """What is missing: references and their twins, then cases. Returns 1 if something failed."""
     drawn = release(args.set)
     cases = chosen(drawn, args.only)
+    try:
+        args.work.mkdir(parents=True, exist_ok=True)
+        (args.work / ".writable").touch()
+        (args.work / ".writable").unlink()
+    except OSError as error:
+        raise ConfigError("--work", got=f"{args.work}: {error.strerror}", allowed="a folder to write in") from error
     references = {c.reference for c in cases}
     failed = _all(
         "twin", sorted(r for r in references if not (twin_of(args.work, r) / TWIN).exists()), args.jobs,

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import os
 import shlex
 import subprocess
@@ -33,6 +34,8 @@ from pathlib import Path
 
 from pred_core.bag.dataset import Dataset, load_dataset, write_dataset
 from pred_core.bag.measured import measured_or_explain
+from pred_core.errors import ConfigError, PredError
+from pred_core.twin import Twin
 
 EFFECTS = "bending_damping,bending_hysteresis,rest_curvature,bending_profile"
 CONTINUOUS = "stiffness,bending_stiffness"  # first neighbours alone: skip springs would bend a second time
@@ -51,7 +54,16 @@ SEEDS = (0, 1, 2)
 
 
 def main() -> int:
-    """Run the steps for one cable."""
+    """Run the steps for one cable; 2 for bad input, in one line."""
+    try:
+        return run_steps()
+    except PredError as error:
+        print(f"measured_cables: {error}", file=sys.stderr)
+        return 2
+
+
+def run_steps() -> int:
+    """Each step that is not there yet. Raises: PredError."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cable", choices=("dlo1", "dlo2"))
     parser.add_argument("--out", type=Path, default=Path("out/cables"))
@@ -128,7 +140,23 @@ def identify(data: Path, twin: Path, flags: list[str]) -> None:
 
 
 def train(data: Path, twin: Path, out: Path, seed: int, steps: int, flags: Sequence[str] = TRAIN) -> None:
-    """`pred train`, resumed where it stopped, unless the weights are there."""
+    """`pred train`, resumed where it stopped, unless the weights are there.
+
+    Raises: ConfigError if what is there was asked otherwise: other steps, seed, flags, data or twin.
+    """
+    dataset = load_dataset(data)
+    asked = {"data": [dataset.sha256(e) for e in dataset.entries], "twin": Twin.load(twin).digest(),
+             "seed": seed, "steps": steps, "flags": list(flags)}  # fmt: skip
+    beside = out.parent / f"{out.name}.asked.json"
+    if beside.exists():
+        before = json.loads(beside.read_text(encoding="utf-8"))
+        other = [k if k in ("data", "twin") else f"{k} {before.get(k)}, now {v}" for k, v in asked.items()
+                 if before.get(k) != v]  # fmt: skip
+        if other:
+            raise ConfigError(f"{out} was trained otherwise", got="; ".join(other), next_step="Give another --out")
+    else:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        beside.write_text(json.dumps(asked) + "\n", encoding="utf-8")
     if not (out / "residual.safetensors").exists():
         resume = ["--resume"] if (out / "train.checkpoint.safetensors").exists() else []
         settings = [] if resume else [*flags, "--steps", str(steps), "--seed", str(seed)]

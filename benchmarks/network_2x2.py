@@ -89,7 +89,7 @@ def main() -> int:
     args = parser.parse_args()
     try:
         return make_tables(args)
-    except PredError as error:
+    except (PredError, OSError) as error:
         print(f"network_2x2: {error}", file=sys.stderr)
         return BAD_INPUT
 
@@ -98,8 +98,15 @@ def make_tables(args: argparse.Namespace) -> int:
     """The tables that are asked for, printed and written. Raises: PredError."""
     if args.kind == "cable" and args.folds not in (0, *range(2, 71)):
         raise ConfigError("--folds", got=args.folds, allowed="0, or 2 to 70")
+    for flag in ("steps", "fold_steps"):
+        if getattr(args, flag, 1) < 1:
+            raise ConfigError(f"--{flag.replace('_', '-')}", got=getattr(args, flag), allowed="1 or more")
     settings = {name: SETTINGS[args.kind][name] for name in args.settings}
+    args.out.mkdir(parents=True, exist_ok=True)
     if args.kind == "case":
+        for path in (args.base, args.extended):
+            Twin.load(path)  # all of it before hours of training
+        load_dataset(args.dataset)
         setup = Setup(args.dataset, {"base": args.base, "extended": args.extended}, args.out, args.steps)
         tables = published(setup, settings, "mde")[0]
     else:

@@ -15,6 +15,7 @@ import dataclasses
 import hashlib
 import json
 import shutil
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +33,7 @@ from pred_core.errors import TwinError, nearest
 from pred_core.types import Body, Box, Capsule, Fixture, ObjectInfo, Physics, Scene, Sphere
 
 FORMAT = 1
+MAKE_ONE = "Make one with: pred identify DATASET --out TWIN"
 ENTRY = ("id", "version", "parameters", "evidence")  # keys of an entry of extensions.yaml; the last may be left out
 _FIXTURES: dict[str, type] = {"box": Box, "capsule": Capsule, "sphere": Sphere}
 
@@ -140,12 +142,12 @@ class Twin:
     def load(cls, path: Path) -> Twin:
         """Read a twin directory. Raises: TwinError or ConfigError naming the file and the key."""
         path = Path(path)
-        for name in ("twin.yaml", "body.npz", "physics.yaml"):
+        for name in ("twin.yaml", "body.npz", "physics.yaml", "extensions.yaml"):
             if not (path / name).is_file():
                 raise TwinError(
                     f"{path}: not a twin, '{name}' is missing",
                     got=", ".join(sorted(p.name for p in path.iterdir())[:8]) if path.is_dir() else "no such directory",
-                    next_step="Make one with: pred identify DATASET --out TWIN",
+                    next_step="An empty list, [], means no effects" if name == "extensions.yaml" else MAKE_ONE,
                 )
         meta_map = dict(load_yaml(path / "twin.yaml") or {})
         if meta_map.get("format") != FORMAT:
@@ -159,6 +161,12 @@ class Twin:
             values = {k: v["value"] for k, v in entries.items()}
         except (TypeError, KeyError, AttributeError) as error:
             raise TwinError(f"{path}/physics.yaml: each parameter needs a 'value'", got=error) from error
+        lacking = [f.name for f in dataclasses.fields(Physics) if f.name not in values]
+        if lacking:
+            raise TwinError(
+                f"{path}/physics.yaml: parameters are missing", got=", ".join(values) or "none",
+                allowed=f"{', '.join(lacking)} too, each with a 'value'", next_step="Identify the twin again",
+            )  # fmt: skip
         report = {k: {a: b for a, b in v.items() if a not in ("value", "unit")} for k, v in entries.items()}
         return cls(
             meta=from_mapping(TwinMeta, meta_map, f"{path}/twin.yaml"),
@@ -194,10 +202,10 @@ def _load_body(path: Path) -> Body:
             if missing:
                 raise TwinError(f"{path}: arrays are missing", got=", ".join(data.files), allowed=", ".join(missing))
             arrays = {f.name: data[f.name] for f in dataclasses.fields(Body)}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         if isinstance(error, TwinError):
             raise
-        raise TwinError(f"{path}: cannot be read", got=error) from error
+        raise TwinError(f"{path}: cannot be read", got=error, next_step="Identify the twin again") from error
     arrays["kind"], arrays["radius"] = str(arrays["kind"]), float(arrays["radius"])
     body = Body(**arrays)  # type: ignore[arg-type]
     for f in dataclasses.fields(body):
@@ -208,15 +216,18 @@ def _load_body(path: Path) -> Body:
 
 
 def _load_extensions(path: Path) -> tuple[Extension, ...]:
-    if not path.is_file():
-        return ()
     entries = load_yaml(path) or []
     if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
         raise TwinError(f"{path}: not a list of entries", allowed=f"each with {', '.join(ENTRY)}")
     try:
-        return tuple(_extension(e, f"{path}: entry {n}", str(path)) for n, e in enumerate(entries, 1))
+        found = tuple(_extension(e, f"{path}: entry {n}", str(path)) for n, e in enumerate(entries, 1))
     except (TypeError, KeyError, AttributeError) as error:
         raise TwinError(f"{path}: malformed entry", got=error, allowed=", ".join(ENTRY)) from error
+    ids = [e.id for e in found]
+    for id in ids:
+        if ids.count(id) > 1:
+            raise TwinError(f"{path}: '{id}' is listed twice", allowed="each once", next_step="Remove one of them")
+    return found
 
 
 def _extension(entry: Mapping[str, Any], where: str, file: str) -> Extension:

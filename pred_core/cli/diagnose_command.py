@@ -32,7 +32,7 @@ from pred_core.diagnose.report import write_report
 from pred_core.diagnose.report_network import read_network
 from pred_core.diagnose.result import Diagnosis
 from pred_core.diagnose.run import diagnose
-from pred_core.errors import ConfigError, DatasetError
+from pred_core.errors import BagError, ConfigError, DatasetError
 from pred_core.evaluate.report import write_json
 from pred_core.twin import Twin
 from pred_core.types import Episode
@@ -77,8 +77,8 @@ def run(args: argparse.Namespace) -> int:
     reference = None if args.reference is None else load_dataset(args.reference)
     tell = _Progress(begin)
     journal = _journal(args, dataset, reference, twin, config, tell)
-    episodes = list(dataset.episodes())
-    known = None if reference is None else list(reference.episodes())
+    episodes = _read(dataset, "")
+    known = None if reference is None else _read(reference, "reference ")
     answer = diagnose(episodes, twin, known, config, tell, journal=journal, begin=begin)
     command = "pred " + shlex.join(_words(args))
     meta = dataclasses.replace(answer.twin.meta, created_by=command)
@@ -96,6 +96,14 @@ def run(args: argparse.Namespace) -> int:
         print(f"  {row.probability:5.2f}  {row.id:24s} {row.rejected}")
     print(f"{args.out / 'report.html'}  {args.out / 'diagnosis.json'}  {args.out / TWIN}  ({answer.seconds:.0f} s)")
     return 0
+
+
+def _read(dataset: Dataset, which: str) -> list[Episode]:
+    """All episodes; what is wrong with one is said with its data set: two may have bags of one name."""
+    try:
+        return list(dataset.episodes())
+    except (BagError, DatasetError) as error:
+        raise type(error)(f"{which}{dataset.root}: {error}") from error
 
 
 def _check_guard_alone(args: argparse.Namespace) -> None:

@@ -7,6 +7,7 @@ import importlib
 import sys
 from collections.abc import Sequence
 from types import ModuleType
+from typing import NoReturn
 
 from pred_core.errors import PredError, nearest
 
@@ -49,8 +50,16 @@ def _module(name: str) -> ModuleType:
     return importlib.import_module(f"pred_core.cli.{name}_command")
 
 
+class _Parser(argparse.ArgumentParser):
+    """argparse whose errors are one line like every other."""
+
+    def error(self, message: str) -> NoReturn:
+        command = self.prog.removeprefix("pred").strip()
+        raise PredError(f"{command} {message}".strip(), next_step=f"See {self.prog} --help")
+
+
 def _parser(modules: dict[str, ModuleType]) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="pred", description="Track, predict, diagnose and drive soft objects.")
+    parser = _Parser(prog="pred", description="Track, predict, diagnose and drive soft objects.")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, module in modules.items():
         sub = subparsers.add_parser(name, help=module.HELP, description=module.HELP)

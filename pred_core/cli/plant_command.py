@@ -134,6 +134,8 @@ def hidden_effects(names: list[str], magnitudes: list[float]) -> Hidden:
         if any(magnitudes):
             raise ConfigError("--magnitude without an effect", got=magnitudes, next_step="Name one with --effect")
         return ()
+    if NONE in names:
+        raise ConfigError("--effect none", got=f"beside {', '.join(n for n in names if n != NONE)}", allowed="alone")
     entries = [find_entry(name) for name in names]
     if magnitudes and len(magnitudes) != len(entries):
         raise ConfigError("--magnitude", got=f"{len(magnitudes)} values", allowed=f"one an effect, {len(entries)}")

@@ -24,7 +24,7 @@ from pred_core.diagnose.ranking import EVEN, ranking
 from pred_core.diagnose.refining import Refined, moved, refining_said
 from pred_core.diagnose.result import Cause, Diagnosis, Errors
 from pred_core.diagnose.roll import Roller
-from pred_core.diagnose.said import not_identifiable, sentence, unproven, without_interval
+from pred_core.diagnose.said import not_identifiable, sentence, unmoved, unproven, without_interval
 from pred_core.effects import LIBRARY
 from pred_core.twin import Twin
 from pred_core.types import Episode
@@ -235,6 +235,7 @@ def _notes(
         *progress.notes,
         refining,
         unproven(causes, errors, study.bench.config.window),
+        unmoved(causes, errors),
         one_recording(study.bench),
         without_interval(causes),
     ]

@@ -27,6 +27,13 @@ def check_tracks(suspect: Sequence[Episode], reference: Sequence[Episode], twin:
                     got=_ids(more),
                     next_step="Identify a twin from this data set or its reference",
                 )
+            without = _without(e, have)
+            if title and without and e.split != "ood" and not any(_without(o, have) for o in suspect):
+                raise DatasetError(
+                    f"{where}: particles of the twin are not in its tracks",
+                    got=f"no {_ids(without)}",
+                    next_step="Give a --reference of the same object, or identify a twin from it",
+                )
             dark = ~np.isfinite(e.position).all(axis=-1)  # (T, P)
             never = [int(i) for i in e.tracks.id[np.all(dark, axis=0)] if int(i) in have]
             if never:
@@ -44,6 +51,11 @@ def check_tracks(suspect: Sequence[Episode], reference: Sequence[Episode], twin:
                 allowed=f"{twin.meta.period:.6g} s within {PERIOD_TOLERANCE:.0%}",
                 next_step="Give a --reference recorded at the data set's rate",
             )
+
+
+def _without(e: Episode, have: set[int]) -> list[int]:
+    """Ids that an episode does not track."""
+    return sorted(have - {int(i) for i in e.tracks.id})
 
 
 def _other_rate(e: Episode, twin: Twin) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -44,6 +45,7 @@ SURE = 0.02  # p value of a lack of fit
 FEW, FINALISTS = 2, 5  # candidates that are fitted to the end: at least, and at most
 BEHIND = 0.35  # share of the leader's gain below which the others are not
 TOLD = 4  # candidates between two lines
+QUIET = 15.0  # [s] without a line, at most by one candidate
 NOISE = 0.4  # loss of residuals that are noise: the mean of rho(u) for u ~ N(0, 1) is 0.36
 UNEXPLAINED = 1.2  # loss beyond which, without a reference, what is left is worth saying
 USUALLY = 3.0  # times the reference's loss: the same where there are too few episodes for a test
@@ -104,12 +106,13 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
     progress.well = explains_well(bench)
     named = [i for n in progress.named for i in n.judged.trial.ids]
     options, passed = candidates(bench, named)
-    screened = []
+    screened, told = [], time.monotonic()
     pace = Pace(len(options), progress.journal)
     for n, effects in enumerate(options):
         key = f"{number}/screen/{'+'.join(e.id for e in effects)}"
         screened.append(screen(bench, effects, rng_of(config.seed, key), progress.journal, key))
-        if n % 8 == 0:
+        if n % 8 == 0 or time.monotonic() - told > QUIET:
+            told = time.monotonic()
             left = pace.left(n + 1) if n else ""  # the first ones are the cheapest
             tell(f"round {number + 1}: screening {n + 1}/{len(options)}{left}")
     screened.sort(key=lambda s: -s.promise)

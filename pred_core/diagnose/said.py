@@ -40,6 +40,7 @@ NAMES = {
     "camera_rotation": "a rotation of the camera", "camera_translation": "a shift of the camera",
     "gripper_offset": "an offset of the gripper frame",
 }  # fmt: skip
+FAR, HELPED = 3.0, 0.9  # times the median episode's error; share of its own that an episode keeps: no cause helped it
 STILL = 0.01  # [m] of gripper travel in an episode below which nothing is excited
 
 
@@ -138,6 +139,17 @@ def unproven(causes: Sequence[Cause], e: Errors, window: float) -> str:
         f"what was found was {how}; on {held} the error did not fall ({e.base.mean:.1f} to {e.extended.mean:.1f} mm): "
         f"the {'calibration' if measured else 'extension'} should not be used for prediction unchecked"
     )
+
+
+def unmoved(causes: Sequence[Cause], e: Errors) -> str:
+    """Episodes that still err FAR times what the others do and that no named cause has made better; "" without any."""
+    usual = float(np.median(e.extended.values))
+    rows = [
+        f"{name} ({after:.1f} of {before:.1f} mm left)"
+        for name, before, after in zip(e.base.names, e.base.values, e.extended.values, strict=True)
+        if after > FAR * usual and after > HELPED * before
+    ]
+    return f"not explained by what was named: {', '.join(rows)}" if causes and rows else ""
 
 
 def without_interval(causes: Sequence[Cause]) -> str:
