@@ -49,7 +49,7 @@ SINGLES = (
     Case("drag", 7202, (("drag_linear", 1.8),), ("drag_linear",)),
     Case("friction", 7206, (("friction_scale", 1.2),), ("friction_scale",)),
     Case("table", 7210, (("table_height", 0.018),), ("table_height",)),
-    Case("mass", 7241, (("mass_gradient", 1.9),), ("mass_gradient",)),
+    Case("mass", 7241, (("mass_gradient", 1.5),), ("mass_gradient",)),
     Case("slip", 7240, (("gripper_slip", 13.0),), ("grip_slip",)),
     Case("stiffness_drift", 7120, (("stiffness_drift", 2.6),), ("stiffness_drift",)),
     Case("delay", 7222, (("action_delay", 40.0),), ("delay",)),

@@ -31,6 +31,10 @@ def test_the_size_of_what_is_hidden_is_found(hidden_answers: Answers) -> None:
     assert drag == pytest.approx(1.8, rel=0.15)
     assert table == pytest.approx(0.018, rel=0.15)
     assert delay == pytest.approx(0.040, rel=0.15)
+    mass = hidden_answers[SINGLES[3]]["causes"][0]["parameters"]["slope"]["value"]
+    offset = hidden_answers[SINGLES[7]]["causes"][0]["parameters"]
+    assert mass == pytest.approx(1.5, rel=0.15)
+    assert sum(v["value"] ** 2 for v in offset.values()) ** 0.5 == pytest.approx(0.013, rel=0.15)
 
 
 def test_the_extended_twin_predicts_better_than_the_base(hidden_answers: Answers) -> None:
