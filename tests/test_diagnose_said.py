@@ -288,7 +288,11 @@ def test_an_episode_that_nothing_named_makes_better_is_told(twin: Twin, dragged:
 
 def test_what_only_the_gate_saw_is_not_nothing(twin: Twin, dragged: list[Episode]) -> None:
     """Slip of 35 mm in the tracks that no candidate explains: the answer says so, and is not "nothing"."""
-    gate = gate_of(measured("grip_slip", 35.0), measured("delay"))
+    plain = gate_of(measured("grip_slip", 35.0), measured("delay"))
+    slides = {f"ep{n}": (0.0, 0.035 if n < 3 else 0.001) for n in range(12)}
+    gate = dataclasses.replace(plain, slides=slides)
+    once = dataclasses.replace(plain, slides={**slides, "ep0": (0.0,), "ep1": (0.002,)})
+    assert not seen_only(once, ()), "in one episode only"
     seen = seen_only(gate, (delay_of(0.5),))
     assert seen == {"grip_slip": 35.0}
     assert outcome_of((), progress_of((0, 1)), tuple(seen)) == "unknown"

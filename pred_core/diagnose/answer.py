@@ -14,7 +14,7 @@ from pred_core.config import to_mapping
 from pred_core.diagnose.causes import causes_of, evidence_of, family_of
 from pred_core.diagnose.errors import EpisodeErrors, episode_errors, gain_of
 from pred_core.diagnose.evidence import FEWEST_ACTING
-from pred_core.diagnose.gate import GateResult
+from pred_core.diagnose.gate import SMALLEST_SLIDE, GateResult
 from pred_core.diagnose.gate_table_causes import PLANE_CAUSES
 from pred_core.diagnose.judge import Bench, Tell
 from pred_core.diagnose.naming import exploratory, one_recording
@@ -30,6 +30,7 @@ from pred_core.twin import Twin
 from pred_core.types import Episode
 
 CHEAP = 10.0  # [s] that replaying the given twin may take, for what refining changed
+SLIDING = 3  # episodes in which held particles slide, for slip that no candidate explains to be the answer
 PARTLY = 0.3  # share of the excess from which what was measured is the answer although something is left
 
 
@@ -93,12 +94,16 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
 
 
 def seen_only(gate: GateResult, causes: Sequence[Cause]) -> dict[str, float]:
-    """What the gate found that is physics, and that no candidate explains -> its size [mm] at the object."""
+    """What the gate found that is physics, and that no candidate explains -> its size [mm] at the object; sliding in
+    SLIDING episodes at least: one in which the track of the jaws wanders is no cause."""
     families = {c.family for c in causes}
+    sliding = sum(max(map(abs, path), default=0.0) > SMALLEST_SLIDE for path in gate.slides.values())
     return {
         c.id: c.effect_mm
         for c in gate.accepted
-        if c.id not in gate.sensor_ids and (family_of(c.id) if c.id in LIBRARY else "table") not in families
+        if c.id not in gate.sensor_ids
+        and (c.id != "grip_slip" or sliding >= SLIDING)
+        and (family_of(c.id) if c.id in LIBRARY else "table") not in families
     }
 
 
