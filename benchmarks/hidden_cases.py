@@ -26,7 +26,7 @@ REFERENCES = (50000, 51000, 52000, 53000)
 # the seed of a reference, which was not its own.)
 SEEN = (
     (50100, 2, 40, 29), (50200, 3, 42, 106), (50500, 4, 40, 34), (50700, 5, 40, 64), (51100, 6, 40, 78),
-    (51400, 7, 40, 102), (51600, 8, 40, 102), (51900, 10, 40, 102),
+    (51400, 7, 40, 102), (51600, 8, 40, 102), (51900, 10, 40, 102), (52100, 11, 40, 102),
 )  # fmt: skip
 LEAST, MOST = 2.0, 10.0  # magnitudes, in multiples of the effect's declared minimum, log-uniform
 
@@ -101,7 +101,7 @@ def release(which: str) -> Release:
         sized = _release(REFERENCES, [(51801 + k, ((n, m),)) for k, (n, m, _) in enumerate(both)])
         found = (dataclasses.replace(c, extent=e) for c, (_, _, e) in zip(sized.cases, both, strict=True))
         return Release(sized.references, tuple(found))
-    return _release(REFERENCES, cases(52100, 11, 40, 46, 10, 6))
+    return _release(REFERENCES, cases(52300, 12, 40, 46, 10, 6))
 
 
 def simulate(root: Path, hidden: Hidden, seed: int, extent: float = 1.0) -> None:
