@@ -16,6 +16,7 @@ from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.pace import Pace
 from pred_core.diagnose.progress import Progress
 from pred_core.diagnose.roll import Roller
+from pred_core.diagnose.rounds import one_round
 from pred_core.diagnose.run import LATEST, OVER, diagnose
 from pred_core.diagnose.sample import make_sample
 
@@ -46,8 +47,9 @@ def test_what_is_left_goes_by_the_pieces_that_took_time() -> None:
 )
 def test_no_round_begins_that_would_end_far_too_late(passed: float, took: float, slower: float, may: bool) -> None:
     begin, needed = time.monotonic() - passed, 100.0
-    roller = SimpleNamespace(usual=lambda: slower * needed)
-    bench: Any = SimpleNamespace(target=SimpleNamespace(roller=roller))
+    roller = SimpleNamespace(usual=lambda: 0.5 * needed, demand=lambda candidate: slower * needed)
+    twin = SimpleNamespace(physics=None, extensions=())  # what it needs grows with what was named
+    bench: Any = SimpleNamespace(target=SimpleNamespace(roller=roller), twin=twin)
     deadline, latest = begin + 300.0 * LATEST, begin + 300.0 * (1.0 + OVER)
     progress = Progress(bench, cast(Journal, None), [], deadline, latest, took, needed)
     assert progress.time_for_another() == may
@@ -67,6 +69,25 @@ def test_the_first_round_always_ends_and_its_lines_say_what_is_left() -> None:
     stopped = [n for n in found.notes if n.startswith("stopped after 1 rounds: no time for more in --seconds 1")]
     assert len(stopped) <= 1
     assert not any(line.startswith("round 2") for line in lines)
+
+
+def test_a_later_round_that_takes_too_long_is_given_up_and_what_was_found_stands(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What was named can make every rollout much slower: round 2 of a damped rope took 800 s, 115 were expected."""
+    twin, lines = rope(), []
+    suspect, known = recorded(twin, drag(), SPLITS, frames=40), recorded(twin, (), SPLITS, seed=100, frames=40)
+
+    def late(progress: Progress, tell: Any, number: int) -> bool:
+        progress.latest = time.monotonic() - 1.0 if number else progress.latest
+        return one_round(progress, tell, number)
+
+    monkeypatch.setattr("pred_core.diagnose.run.one_round", late)
+    monkeypatch.setattr("pred_core.diagnose.run.something_left", lambda progress: True)
+    found = diagnose(suspect, twin, known, SMALL, lines.append)
+    assert [c.id for c in found.causes] == ["drag_linear"] and len(found.rounds) == 1
+    assert "round 2 was given up: it takes longer than --seconds allow" in found.notes
+    assert any(line.startswith("round 2: ") for line in lines) and not any("round 3" in line for line in lines)
 
 
 def test_a_twin_that_needs_many_substeps_is_said_to_take_long() -> None:

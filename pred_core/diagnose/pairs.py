@@ -40,6 +40,8 @@ def try_pairs(
             continue
         if judged[a].mean + judged[b].mean < 0.6 * excess:
             continue
+        if progress.overdue():
+            break
         effects: Effects = (*kept[a].effects, *kept[b].effects)
         trial = bench.trial(effects)
         begin = trial.space.start()

@@ -11,10 +11,15 @@ from dataclasses import dataclass, field
 from pred_core.diagnose.evidence import Judged
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Bench, standing_of
+from pred_core.identify.space import Candidate
 from pred_core.twin import Twin
 from pred_core.types import Array
 
 SLOWER = 2.0  # times the substeps of the round before, from which its expected time must be there before the deadline
+
+
+class OutOfTime(Exception):
+    """A round is given up: what it found is in the journal."""
 
 
 @dataclass(frozen=True)
@@ -107,14 +112,28 @@ class Progress:
         return self.took * max(self.slower(), 1.0)
 
     def slower(self) -> float:
-        """Times the substeps of the last round that another one needs."""
-        return self.bench.target.roller.usual() / self.needed if self.needed else 1.0
+        """Times the substeps of the last round that another one needs: what was named may ask for more."""
+        return self.substeps() / self.needed if self.needed else 1.0
+
+    def substeps(self) -> float:
+        """A period that the twin needs with all that was named."""
+        twin, roller = self.bench.twin, self.bench.target.roller
+        return max(roller.usual(), roller.demand(Candidate(twin.physics, twin.extensions)))
 
     def time_for_another(self) -> bool:
         """Whether another round may begin. One that is much slower than the last is known badly: it must end sooner."""
         if self.late(self.expected() if self.slower() > SLOWER else 0.0):
             return False
         return time.monotonic() + self.expected() <= self.latest
+
+    def go_on(self, number: int) -> None:
+        """Raise OutOfTime in the middle of a later round that takes longer than was expected; the first always ends."""
+        if number and self.overdue():
+            raise OutOfTime
+
+    def overdue(self) -> bool:
+        """Whether what has begun takes longer than was expected."""
+        return time.monotonic() > self.latest
 
     def late(self, needs: float = 0.0) -> bool:
         """Whether the time is used up, or would be after `needs` [s] more."""

@@ -109,6 +109,7 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
     screened, told = [], time.monotonic()
     pace = Pace(len(options), progress.journal)
     for n, effects in enumerate(options):
+        progress.go_on(number)
         key = f"{number}/screen/{'+'.join(e.id for e in effects)}"
         screened.append(screen(bench, effects, rng_of(config.seed, key), progress.journal, key))
         if n % 8 == 0 or time.monotonic() - told > QUIET:
@@ -123,6 +124,7 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
     judged: list[Judged] = []
     pace = Pace(len(finalists), progress.journal)
     for n, s in enumerate(finalists):
+        progress.go_on(number)
         judged.append(judge(bench, s, progress.journal, f"{number}/fit/{s.trial.id}"))
         gain = f"gain {judged[-1].mean:.3f} of {base.mean():.3f}"
         tell(f"round {number + 1}: fitted {n + 1}/{len(finalists)}, {s.trial.id}: {gain}{pace.left(n + 1)}")
@@ -235,6 +237,7 @@ def _halve(
     for n, s in enumerate(kept):
         if n % TOLD == 1:
             tell(f"round {number + 1}: first {QUICK} steps of the promising ones {n}/{len(kept)}{pace.left(n)}")
+        progress.go_on(number)
         z, loss = quick(bench, s, progress.journal, f"{number}/quick/{s.trial.id}")
         rows.append((before - loss, dataclasses.replace(s, starts=[Start(z, before - loss)])))
     rows.sort(key=lambda row: -row[0])

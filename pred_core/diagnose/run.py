@@ -15,7 +15,7 @@ from pred_core.diagnose.form import check_forms, check_table
 from pred_core.diagnose.gate import measure
 from pred_core.diagnose.journal import Journal
 from pred_core.diagnose.judge import Tell
-from pred_core.diagnose.progress import Named, Progress
+from pred_core.diagnose.progress import Named, OutOfTime, Progress
 from pred_core.diagnose.result import Diagnosis
 from pred_core.diagnose.rounds import finish, one_round, something_left
 from pred_core.diagnose.skill import check_reference
@@ -90,10 +90,15 @@ def diagnose(
 
 def _timed_round(progress: Progress, tell: Tell, number: int, ends: float) -> bool:
     """`one_round`, and how long it took. `ends` [s] of `time.monotonic`: when the time is over."""
-    started, needs = time.monotonic(), progress.bench.target.roller.usual()
+    started, needs = time.monotonic(), progress.substeps()
     about = f"about {progress.expected():.0f} s, as the one before; " if progress.took >= 1.0 else ""
     tell(f"round {number + 1}: {about}{max(ends - started, 0.0):.0f} s left of --seconds")
-    more = one_round(progress, tell, number)
+    try:
+        more = one_round(progress, tell, number)
+    except OutOfTime:
+        progress.notes.append(f"round {number + 1} was given up: it takes longer than --seconds allow")
+        tell(progress.notes[-1])
+        more = False
     progress.took, progress.needed = time.monotonic() - started, needs
     return more
 
