@@ -117,7 +117,7 @@ def run_cases(args: argparse.Namespace) -> int:
     try:
         args.work.mkdir(parents=True, exist_ok=True)
         (args.work / ".writable").touch()
-        (args.work / ".writable").unlink()
+        (args.work / ".writable").unlink(missing_ok=True)
     except OSError as error:
         raise ConfigError("--work", got=f"{args.work}: {error.strerror}", allowed="a folder to write in") from error
     references = {c.reference for c in cases}

@@ -57,7 +57,7 @@ def main() -> int:
     """Run the steps for one cable; 2 for bad input, in one line."""
     try:
         return run_steps()
-    except PredError as error:
+    except (PredError, OSError) as error:
         print(f"measured_cables: {error}", file=sys.stderr)
         return 2
 
@@ -142,13 +142,17 @@ def identify(data: Path, twin: Path, flags: list[str]) -> None:
 def train(data: Path, twin: Path, out: Path, seed: int, steps: int, flags: Sequence[str] = TRAIN) -> None:
     """`pred train`, resumed where it stopped, unless the weights are there.
 
-    Raises: ConfigError if what is there was asked otherwise: other steps, seed, flags, data or twin.
+    Raises: ConfigError if what is there was asked otherwise: other steps, seed, flags, data or twin. What was trained
+    before that was written down is taken as it is, and said.
     """
+    begun = [n for n in ("residual.safetensors", "train.checkpoint.safetensors") if (out / n).exists()]
     dataset = load_dataset(data)
     asked = {"data": [dataset.sha256(e) for e in dataset.entries], "twin": Twin.load(twin).digest(),
              "seed": seed, "steps": steps, "flags": list(flags)}  # fmt: skip
     beside = out.parent / f"{out.name}.asked.json"
-    if beside.exists():
+    if begun and not beside.exists():
+        print(f"{out}: was trained before; with what settings is not known", flush=True)
+    elif begun:
         before = json.loads(beside.read_text(encoding="utf-8"))
         other = [k if k in ("data", "twin") else f"{k} {before.get(k)}, now {v}" for k, v in asked.items()
                  if before.get(k) != v]  # fmt: skip
@@ -156,7 +160,9 @@ def train(data: Path, twin: Path, out: Path, seed: int, steps: int, flags: Seque
             raise ConfigError(f"{out} was trained otherwise", got="; ".join(other), next_step="Give another --out")
     else:
         out.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_text(json.dumps(asked) + "\n", encoding="utf-8")
+        part = beside.with_suffix(".part")
+        part.write_text(json.dumps(asked) + "\n", encoding="utf-8")
+        part.replace(beside)
     if not (out / "residual.safetensors").exists():
         resume = ["--resume"] if (out / "train.checkpoint.safetensors").exists() else []
         settings = [] if resume else [*flags, "--steps", str(steps), "--seed", str(seed)]

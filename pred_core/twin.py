@@ -16,6 +16,7 @@ import hashlib
 import json
 import shutil
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -162,7 +163,7 @@ class Twin:
         except (TypeError, KeyError, AttributeError) as error:
             raise TwinError(f"{path}/physics.yaml: each parameter needs a 'value'", got=error) from error
         lacking = [f.name for f in dataclasses.fields(Physics) if f.name not in values]
-        if lacking:
+        if lacking and values.keys() <= {f.name for f in dataclasses.fields(Physics)}:  # else a name is misspelt
             raise TwinError(
                 f"{path}/physics.yaml: parameters are missing", got=", ".join(values) or "none",
                 allowed=f"{', '.join(lacking)} too, each with a 'value'", next_step="Identify the twin again",
@@ -202,7 +203,7 @@ def _load_body(path: Path) -> Body:
             if missing:
                 raise TwinError(f"{path}: arrays are missing", got=", ".join(data.files), allowed=", ".join(missing))
             arrays = {f.name: data[f.name] for f in dataclasses.fields(Body)}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zlib.error, zipfile.BadZipFile) as error:
         if isinstance(error, TwinError):
             raise
         raise TwinError(f"{path}: cannot be read", got=error, next_step="Identify the twin again") from error

@@ -94,7 +94,7 @@ def test_a_wrong_number_of_the_twin_is_refined_and_said_and_is_no_other_cause(
     assert d.outcome == "none" and not d.causes, d.sentence
     assert d.refined is not None and list(d.refined.moved) == [name]
     given, refined, _ = d.refined.moved[name]
-    assert given == pytest.approx(factor * value) and refined == pytest.approx(value, rel=0.15)
+    assert given == pytest.approx(factor * value) and refined == pytest.approx(value, rel=0.05)
     assert d.refined.given is not None and d.refined.base < 0.6 * d.refined.given
     assert f"{name.replace('_', ' ')} {given:.3g} to {refined:.3g}" in d.sentence
     assert d.to_json()["base"]["parameters"][name]["refined"] == refined == getattr(d.twin.physics, name)

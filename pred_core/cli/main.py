@@ -55,7 +55,7 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         command = self.prog.removeprefix("pred").strip()
-        raise PredError(f"{command} {message}".strip(), next_step=f"See {self.prog} --help")
+        raise PredError(f"{command}: {message}".removeprefix(": "), next_step=f"See {self.prog} --help")
 
 
 def _parser(modules: dict[str, ModuleType]) -> argparse.ArgumentParser:

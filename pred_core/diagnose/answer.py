@@ -5,17 +5,16 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pred_core.calibration import Calibration
 from pred_core.config import to_mapping
-from pred_core.diagnose.causes import causes_of, evidence_of, family_of
+from pred_core.diagnose.causes import causes_of, evidence_of
 from pred_core.diagnose.errors import EpisodeErrors, episode_errors, gain_of
 from pred_core.diagnose.evidence import FEWEST_ACTING
-from pred_core.diagnose.gate import SMALLEST_SLIDE, GateResult
-from pred_core.diagnose.gate_table_causes import PLANE_CAUSES
+from pred_core.diagnose.gate import GateResult
 from pred_core.diagnose.judge import Bench, Tell
 from pred_core.diagnose.naming import exploratory, one_recording
 from pred_core.diagnose.next_motion import propose
@@ -25,12 +24,11 @@ from pred_core.diagnose.refining import Refined, moved, refining_said
 from pred_core.diagnose.result import Cause, Diagnosis, Errors
 from pred_core.diagnose.roll import Roller
 from pred_core.diagnose.said import not_identifiable, sentence, unmoved, unproven, without_interval
-from pred_core.effects import LIBRARY
+from pred_core.diagnose.seen import seen_only
 from pred_core.twin import Twin
 from pred_core.types import Episode
 
 CHEAP = 10.0  # [s] that replaying the given twin may take, for what refining changed
-SLIDING = 3  # episodes in which held particles slide, for slip that no candidate explains to be the answer
 PARTLY = 0.3  # share of the excess from which what was measured is the answer although something is left
 
 
@@ -61,8 +59,7 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         study.gate, progress, {r.id: r.probability for r in ranked}, closed_by_gate(study.gate, budget["named"], errors)
     )
     ood = _errors(study, progress, "ood") if any(e.split == "ood" for e in study.corrected) else None
-    seen = seen_only(study.gate, causes)
-    outcome = outcome_of(causes, progress, tuple(seen))
+    outcome = outcome_of(causes, progress)
     result = Diagnosis(
         outcome=outcome,
         sentence="",
@@ -87,31 +84,16 @@ def answer(study: Study, progress: Progress, begin: float, tell: Tell) -> Diagno
         explained=progress.explained,
         settings=to_mapping(config),
         refined=refining,
-        seen=seen,
+        seen=seen_only(study.gate, progress),
     )
     result = dataclasses.replace(result, next_motion=propose(result, study.corrected, config.seed))
     return dataclasses.replace(result, sentence=sentence(result), seconds=time.monotonic() - begin)
 
 
-def seen_only(gate: GateResult, causes: Sequence[Cause]) -> dict[str, float]:
-    """What the gate found that is physics, and that no candidate explains -> its size [mm] at the object; sliding in
-    SLIDING episodes at least: one in which the track of the jaws wanders is no cause."""
-    families = {c.family for c in causes}
-    sliding = sum(max(map(abs, path), default=0.0) > SMALLEST_SLIDE for path in gate.slides.values())
-    return {
-        c.id: c.effect_mm
-        for c in gate.accepted
-        if c.id not in gate.sensor_ids
-        and (c.id != "grip_slip" or sliding >= SLIDING)
-        and (family_of(c.id) if c.id in LIBRARY else "table") not in families
-    }
-
-
-def outcome_of(causes: Sequence[Cause], progress: Progress, seen: Collection[str] = ()) -> str:
+def outcome_of(causes: Sequence[Cause], progress: Progress) -> str:
     """One of OUTCOMES, from what was found and whether something is left: with too little explained it is unknown.
 
     A law that was fitted must then be the answer more probably than not; what the gate measured is there by itself.
-    `seen`: physics that the gate found and no candidate explains; where a table lies is known from a reference only.
     """
     physics = [c for c in causes if not c.measured]
     cold = progress.bench.reference is None  # nobody knows there how much there is to explain
@@ -121,7 +103,7 @@ def outcome_of(causes: Sequence[Cause], progress: Progress, seen: Collection[str
     if progress.unknown and explained_by(causes) < least:
         return "unknown"
     if not causes:
-        return "unknown" if [s for s in seen if not (cold and s in PLANE_CAUSES)] else "none"
+        return "none"
     return "group" if any(c.group for c in causes) else "named"
 
 
@@ -212,9 +194,11 @@ def closed_by_gate(gate: GateResult, named: Mapping[str, float], errors: Errors)
 
 
 def refining_of(study: Study, errors: Errors, took: float) -> Refined:
-    """What the base is, and by how much it differs from the given twin. `took` [s] of replaying the episodes once."""
+    """What the base is, and by how much it differs from the given twin. `took` [s] of replaying them with it."""
     source = "the train episodes" if study.bench.reference is None else "the reference"
     given = study.given.replace(calibration=Calibration(), residual=None)
+    sample = study.bench.target.roller.sample
+    took *= Roller(given, sample).usual() / Roller(study.bench.twin, sample).usual()
     before = None if took > CHEAP else episode_errors(given, _before(study, errors.split), study.session).mean
     return Refined(source, before, errors.base.mean, moved(given, study.bench.twin))
 
@@ -229,7 +213,8 @@ def not_testable_in(gate: GateResult, progress: Progress) -> Mapping[str, str]:
         idle |= {id: n for id, n in r.excited.items() if n < min(FEWEST_ACTING, len(r.base))}
         rows |= {id: hardly.format(n, len(r.base)) for id, n in idle.items() if id not in found}
         rows |= {id: why for id, why in r.passed.items() if id not in found}
-    return rows
+    shown = {j.trial.id for r in progress.rounds for j, _, _ in r.judged if j.testable}
+    return {id: why for id, why in rows.items() if id not in shown}
 
 
 def _notes(

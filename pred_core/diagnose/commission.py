@@ -35,7 +35,8 @@ POLISH = 8  # steps of the base's refinement
 TIMES = tuple(float(f) for f in np.geomspace(0.1, 10.0, 17))  # what each of its numbers is multiplied by first
 FEW, SWEEPS = 16, 4  # windows in which they are tried; how often, as long as it helps
 VALLEY = 0.8  # of the loss to which the base was refined: what another start must come to, to take its place
-SLOWER = 0.5  # of the loss that the base has: below it a point may need up to twice the substeps that ROOM allows
+SLOWER, FASTER = 0.5, 2.0  # of the loss that the base has: below it a point may need so many times what ROOM allows
+GROWS = 1.3  # times the substeps of such a point that a refinement from it may need
 TURNS = 0.97  # of the loss, to which another value must bring it to be taken: what does not act stays as it is
 
 
@@ -150,6 +151,7 @@ def _polish(twin: Twin, sample: Sample, use: NDArray[np.bool_], config: Diagnose
         other = None if attempt else _elsewhere(target, trial, result.z, use, most)
         if other is not None and other.loss[use].mean() < VALLEY * result.loss[use].mean():
             result = other
+            most = max(most, GROWS * roller.demand(trial.space.candidate(result.z)))
         tell(f"base: loss {before[use].mean():.3f} -> {result.loss[use].mean():.3f}")
         twin = with_values(twin, trial.space.candidate(result.z))
         if result.loss[use].mean() > TURNS * before[use].mean():
@@ -179,7 +181,7 @@ def _elsewhere(target: Target, trial: Trial, refined: Array, use: NDArray[np.boo
         for n, knob in numbers:
             points = [_with_one(best, n, knob, factor * knob.value(float(best[n]))) for factor in TIMES]
             needed = np.array([target.roller.demand(space.candidate(z)) for z in points])
-            slow = (most < needed) & (needed <= 2.0 * most)
+            slow = (most < needed) & (needed <= FASTER * most)
             for bound, fits in ((np.inf, needed <= most), (SLOWER * standing, slow)):
                 possible = [z for z, ok in zip(points, fits, strict=True) if ok]
                 tried = losses(possible) if possible else np.array([np.inf])
@@ -190,7 +192,7 @@ def _elsewhere(target: Target, trial: Trial, refined: Array, use: NDArray[np.boo
     if least >= aim:
         return None
     room = most / max(target.roller.usual(), target.roller.demand(space.candidate(best)))
-    return fit(target, space, best, POLISH, use, max(room, 1.0))
+    return fit(target, space, best, POLISH, use, max(room, GROWS))
 
 
 def _with_one(z: Array, n: int, knob: Knob, value: float) -> Array:

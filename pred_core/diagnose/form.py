@@ -94,7 +94,7 @@ def _saved(progress: Progress, named: Named) -> float:
     """Mean loss that a name took away, in the units of the present round."""
     n = progress.named.index(named)
     before, after = (standing_of(t, progress.bench.target).mean() for t in progress.twins[n : n + 2])
-    return float(before - after)
+    return max(float(before - after), 0.0)
 
 
 def _in_form(bench: Bench, id: str, form: type[Effect]) -> Bench:

@@ -18,7 +18,7 @@ from pred_core.errors import DatasetError, TwinError
 from pred_core.twin import Twin
 
 VERSION = 5  # of the journal's pieces
-CODE = ("diagnose", "effects", "springmass", "identify", "train")  # what an answer comes from
+ELSEWHERE = ("arm", "cli", "estimate", "live", "plan", "plant", "report", "track")  # no answer comes from them
 GRAVITY_APART = 0.01 * 9.81  # [m/s^2] declared gravities may differ by, as vectors: 0.6 degrees of tilt
 SHOWN = 5  # bags in a line
 _FALLBACK = "what it was asked cannot be read"
@@ -45,10 +45,12 @@ def job_of(dataset: Dataset, reference: Dataset | None, twin: Twin, config: Diag
 
 @functools.cache
 def code_digest() -> str:
-    """Of the sources an answer comes from: pieces of two versions are not one answer."""
+    """Of the sources an answer may come from: pieces of two versions are not one answer. Reports are drawn anew."""
     root, digest = Path(__file__).parents[1], hashlib.sha256()
-    for path in sorted(p for name in CODE for p in (root / name).rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    for path in sorted(root.rglob("*.py")):
+        name = path.relative_to(root)
+        if name.parts[0] not in ELSEWHERE and not name.name.startswith(("report", "picture")):
+            digest.update(name.as_posix().encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -97,7 +99,7 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
         found.append("another twin")
     old, new = (dict(re.findall(r"(\w+)=([^,()]+)", str(h["config"]))) for h in (before, now))
     found += [f"{k} {old.get(k, 'unknown')}, now {v}" for k, v in new.items() if old.get(k) != v]
-    if (before["version"], before["code"]) != (now["version"], now["code"]):
+    if (before["version"], before.get("code")) != (now["version"], now["code"]):
         found.append("written by another version")
     return found
 

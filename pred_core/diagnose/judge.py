@@ -261,14 +261,16 @@ def _moved(target: Target, difference: Tensor) -> Array:
 
 def intervals(trial: Trial, z: Array, null: Array, left_out: Array) -> dict[str, tuple[float, float]]:
     """90 %, as values: the jackknife over recordings (Efron 1982) and what simulations of one rope differ by, relative
-    to the change for what switches a cause on, to a typical change for where it is and how it is shaped."""
+    to the change for what switches a cause on, to a typical change for where it is and how it is shaped. What is
+    refitted beside the cause has the scatter alone."""
     groups = len(left_out)
     if groups < 2:
         return {k.name: (k.low, k.high) for k in trial.space.knobs}
     centre = left_out.mean(axis=0)
     error = np.sqrt((groups - 1) / groups * ((left_out - centre) ** 2).sum(axis=0))
     mismatch = SLIDING if set(trial.family.split("+")) & set(SLIDES) else MISMATCH
-    size = np.ones(len(z))  # of a place, a range, a power: a typical change; they have no "off" to be relative to
+    # Of a place, a range, a power: a typical change (they have no "off"); of what is refitted beside: 0.
+    size = np.array([float(any(k.name.startswith(f"{id}.") for id in trial.ids)) for k in trial.space.knobs])
     size[list(trial.amplitudes)] = np.abs(z - null)[list(trial.amplitudes)]
     width = np.hypot(student.ppf(TRUST, groups - 1) * error, Z * mismatch * size)
     return {

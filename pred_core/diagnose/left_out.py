@@ -12,7 +12,7 @@ from pred_core.identify.space import SearchSpace
 from pred_core.types import Array
 
 RAISED = 0.02  # of the other recordings' loss, by which a step that should lower it may raise it: chaos does so much
-DAMPING = (1e-2, 1e-1, 1.0, 10.0)  # of the curvature's diagonal, tried where a step raises it
+DAMPING = (1e-2, 1e-1, 1.0, 10.0, 100.0)  # of the curvature's diagonal, tried where a step raises it
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,12 @@ def moved(given: Twin, base: Twin) -> dict[str, tuple[float, float, str]]:
 
 def moved_in_words(r: Refined) -> str:
     """The numbers of the twin that refining moved, "stiffness 60 to 20.1 N"."""
-    return ", ".join(f"{k.replace('_', ' ')} {a:.3g} to {b:.3g}{f' {u}' if u not in ('', '1') else ''}"
-                     for k, (a, b, u) in r.moved.items())  # fmt: skip
+    rows = []
+    for k, (a, b, unit) in r.moved.items():
+        effect, _, name = k.rpartition(".")
+        words = f"{name} of {effect}" if effect else name
+        rows.append(f"{words.replace('_', ' ')} {a:.3g} to {b:.3g}{f' {unit}' if unit not in ('', '1') else ''}")
+    return ", ".join(rows)
 
 
 def refining_said(r: Refined, split: str) -> str:

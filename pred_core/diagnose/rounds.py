@@ -81,7 +81,7 @@ def _cannot_act(effect: type[Effect], twin: Twin) -> str:
     return "" if bends or not {"bend", "bend_stiffness"} & set(effect.hooks) else "the twin does not bend by angles"
 
 
-def excited(bench: Bench, screened: Sequence[Screened], journal: Journal) -> dict[str, int]:
+def excited(bench: Bench, screened: Sequence[Screened], journal: Journal, key: str) -> dict[str, int]:
     """Candidate -> episodes that a typical change of it would move; not those that act in a place, wherever that is,
     except on a table that nothing touches."""
 
@@ -96,7 +96,7 @@ def excited(bench: Bench, screened: Sequence[Screened], journal: Journal) -> dic
                 found[s.trial.id] = 0
         return found
 
-    return journal.piece("0/excited", find, lambda v: {str(k): int(n) for k, n in v.items()})
+    return journal.piece(key, find, lambda v: {str(k): int(n) for k, n in v.items()})
 
 
 def one_round(progress: Progress, tell: Tell, number: int) -> bool:
@@ -136,8 +136,8 @@ def one_round(progress: Progress, tell: Tell, number: int) -> bool:
         if pair is not None:
             found = pair
             rows = [*rows, (pair.judged, pair.p_adjusted, "")]
-    rest = [s for s in screened if s.trial.id not in {f.trial.id for f in finalists}] if number == 0 else []
-    acting = excited(bench, rest, progress.journal) if rest else {}
+    rest = [s for s in screened if s.trial.id not in {f.trial.id for f in finalists}]
+    acting = {} if progress.rounds else excited(bench, rest, progress.journal, f"{number}/excited")
     screens = tuple((s.trial.id, s.promise) for s in screened)
     progress.rounds.append(Round(base, floor, screens, tuple(rows), acting, passed))
     if found is None:

@@ -18,6 +18,7 @@ from pred_core.diagnose.judge import Tell
 from pred_core.diagnose.progress import Named, OutOfTime, Progress
 from pred_core.diagnose.result import Diagnosis
 from pred_core.diagnose.rounds import finish, one_round, something_left
+from pred_core.diagnose.seen import seen_only
 from pred_core.diagnose.skill import check_reference
 from pred_core.diagnose.structure import applies, question
 from pred_core.errors import DatasetError
@@ -84,6 +85,7 @@ def diagnose(
     check_forms(progress, tell)
     finish(progress)
     check_table(progress, gate)
+    progress.unknown |= not progress.named and bool(seen_only(gate, progress))
     study = Study(tuple(episodes), tuple(corrected), tuple(known), twin, gate, bench, session)
     return answer(study, progress, begin, tell)
 

@@ -68,7 +68,7 @@ def sentence(d: Diagnosis) -> str:
     text = _sentence(d)
     if d.seen:
         found = "; ".join(f"{NAMES.get(id, id)}, {size:.1f} mm at the object" for id, size in d.seen.items())
-        text += f" Seen in the tracks, and explained by no candidate: {found}."
+        text += f" Seen in the tracks, and named by no candidate: {found}."
     if d.refined is None or not d.refined.off:
         return text
     r, held = d.refined, "held-out" if d.errors.split == "test" else "fitted"

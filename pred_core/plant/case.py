@@ -25,7 +25,7 @@ Simulate = Callable[[Sequence[EpisodePlan]], Iterator[tuple[EpisodePlan, Record,
 
 def truth_path(root: Path) -> Path:
     """Where the truth about a data set stands: beside its folder."""
-    root = root if root.name else root.resolve()  # "."
+    root = root if root.name not in ("", "..") else root.resolve()
     return root.with_name(f"{root.name}.truth.json")
 
 
