@@ -33,6 +33,7 @@ WORST = 0.25  # [m] mean error of a twin that is not this object's
 OWN_MISFIT = 0.02  # of the variance a base leaves that weights allow for without a reference
 POLISH = 8  # steps of the base's refinement
 TIMES = tuple(float(f) for f in np.geomspace(0.1, 10.0, 17))  # what each of its numbers is multiplied by first
+CLOSER = (0.8, 0.9, 1.1, 1.25)  # the same once another valley was found, with weights that are of it
 FEW, SWEEPS = 16, 4  # windows in which they are tried; how often, as long as it helps
 VALLEY = 0.8  # of the loss to which the base was refined: what another start must come to, to take its place
 SLOWER, FASTER = 0.5, 2.0  # of the loss that the base has: below it a point may need so many times what ROOM allows
@@ -138,7 +139,8 @@ def with_stored(twin: Twin, values: dict[str, Any]) -> Twin:
 def _polish(twin: Twin, sample: Sample, use: NDArray[np.bool_], config: DiagnoseConfig, tell: Tell) -> Twin:
     """The base and what it already carries, refined on the sample with the loss the candidates are judged by."""
     most = ROOM * Roller(twin, sample).usual()
-    for attempt in range(2):  # the weights follow the parameters
+    times: tuple[float, ...] = TIMES
+    for _ in range(2):  # the weights follow the parameters
         roller = Roller(twin, sample)
         weights = _weigh(roller, Candidate(twin.physics, twin.extensions), config, None)
         target = Target(roller, weights, config.stride)
@@ -148,9 +150,10 @@ def _polish(twin: Twin, sample: Sample, use: NDArray[np.bool_], config: Diagnose
         start = trial.space.start()
         before = target.losses(trial.space, [start])[0]
         result = fit(target, trial.space, start, POLISH, use, most / roller.usual())
-        other = None if attempt else _elsewhere(target, trial, result.z, use, most)
+        other = _elsewhere(target, trial, result.z, use, most, times)
+        times = ()
         if other is not None and other.loss[use].mean() < VALLEY * result.loss[use].mean():
-            result = other
+            result, times = other, CLOSER
             most = max(most, GROWS * roller.demand(trial.space.candidate(result.z)))
         tell(f"base: loss {before[use].mean():.3f} -> {result.loss[use].mean():.3f}")
         twin = with_values(twin, trial.space.candidate(result.z))
@@ -159,12 +162,16 @@ def _polish(twin: Twin, sample: Sample, use: NDArray[np.bool_], config: Diagnose
     return twin
 
 
-def _elsewhere(target: Target, trial: Trial, refined: Array, use: NDArray[np.bool_], most: float) -> Fit | None:
+def _elsewhere(
+    target: Target, trial: Trial, refined: Array, use: NDArray[np.bool_], most: float, times: Sequence[float]
+) -> Fit | None:
     """A refinement from another point than the base; None if no point is better than `refined`.
 
-    Each number of the twin is multiplied by TIMES in turn, as far as `most` substeps a period allow: the loss along a
+    Each number of the twin is multiplied by `times` in turn, as far as `most` substeps a period allow: the loss along a
     stiffness that is three times too large has valleys of its own.
     """
+    if not times:
+        return None
     space, sample = trial.space, target.roller.sample
     windows = np.flatnonzero(use[sample.episode])
     few = target.some(windows[np.linspace(0, len(windows) - 1, min(FEW, len(windows))).astype(np.int64)])
@@ -179,7 +186,7 @@ def _elsewhere(target: Target, trial: Trial, refined: Array, use: NDArray[np.boo
     for _ in range(SWEEPS):
         before = least
         for n, knob in numbers:
-            points = [_with_one(best, n, knob, factor * knob.value(float(best[n]))) for factor in TIMES]
+            points = [_with_one(best, n, knob, factor * knob.value(float(best[n]))) for factor in times]
             needed = np.array([target.roller.demand(space.candidate(z)) for z in points])
             slow = (most < needed) & (needed <= FASTER * most)
             for bound, fits in ((np.inf, needed <= most), (SLOWER * standing, slow)):
